@@ -19,7 +19,6 @@ from scipy.linalg.lapack import dtrtri
 
 from graphslam.core.geometry import Array
 
-
 #: numbers in covariances of cliques that are kept until joint ones are read from them
 NOTED = 1_000_000
 

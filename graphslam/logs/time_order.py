@@ -8,7 +8,7 @@ glitches are detected per topic in the order of recording; then all topics are s
 
 import heapq
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import accumulate, islice
 
@@ -19,8 +19,9 @@ TOO_LATE = "stamp: older than logs.reorder_s allows"
 GLITCH = "stamp: glitch"
 DUPLICATE = "stamp: duplicate"
 REPEATED = "increment: recorded twice"
+REPEATED_SIGHTING = "sighting: recorded twice"
 #: what is counted of messages that are dropped
-DROPPED = (TOO_LATE, REPEATED)
+DROPPED = (TOO_LATE, REPEATED, REPEATED_SIGHTING)
 
 # A stamp is compared with at most this many later ones of its topic within the window: an absurd
 # one far in the future would otherwise never leave the window.
@@ -93,6 +94,7 @@ class MessageSorter:
         self._repairs: dict[str, _GlitchRepair] = {}
         self._heap: list[tuple[tuple[int, int], int, str, Message]] = []
         self._spans: dict[str, tuple[int, int]] = {}  # topic -> that of its latest increment
+        self._seen_ns, self._seen = _LONG_AGO, set[Hashable]()  # the sightings of the latest stamp
         self._number = 0
         self._recorded = 0
         self._latest_ns = self._emitted_ns = self._checked_ns = _LONG_AGO
@@ -150,7 +152,21 @@ class MessageSorter:
                     self.counts[topic][REPEATED] += 1
                     continue
                 self._spans[topic] = span
+            elif isinstance(message, records.Sighting) and self._is_repeated(message):
+                self.counts[topic][REPEATED_SIGHTING] += 1
+                continue
             yield message
+
+    def _is_repeated(self, message: records.Sighting) -> bool:
+        """Whether the same was seen at the same time already: recordings that were put together."""
+        if message.time_ns != self._seen_ns:
+            self._seen_ns, self._seen = message.time_ns, set()
+        numbers = (message.z.tobytes(), message.cov.tobytes(), message.mount.tobytes())
+        whole = (message.robot, message.stamp_ns, message.identity, message.seen_robot, *numbers)
+        if whole in self._seen:
+            return True
+        self._seen.add(whole)
+        return False
 
 
 def merge(files: Sequence[Iterable[Message]]) -> Iterator[Message]:

@@ -16,6 +16,7 @@ from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import Array, between, compose, exp, log, wrap
 from graphslam.core.motion_models import wheel_twist
 from graphslam.core.records import OdometryIncrement, OdometryPose, WheelAngles
+from graphslam.odometry.missing_increments import SAME_NS, MissingIncrements, bridge
 
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
@@ -70,6 +71,8 @@ class Readings:
         #: readings that were made of scans where there were none, see `gap_bridging`
         self.bridged = 0
         self.bridged_sigma_m = 0.0
+        #: what increments leave out
+        self.missing = MissingIncrements()
         self.config, self._robot = config, robot
         self._count, self._bursts, self._resets = 0, 0, 0
         self._forgotten = 0  # readings, see `forget_before`
@@ -117,7 +120,7 @@ class Readings:
         if isinstance(message, OdometryIncrement):
             if not self._count:
                 self._begin("given", message.start_ns)
-            value = np.concatenate([log(message.delta), message.cov.ravel()])
+            value = self._new_part(message)
         elif isinstance(message, OdometryPose):
             value = message.pose
         else:
@@ -127,13 +130,7 @@ class Readings:
             self._begin("wheels" if isinstance(message, WheelAngles) else poses, message.time_ns)
             self._last = value
         elif message.time_ns > self.last_ns:
-            if self._count == len(self._times):
-                self._grow()
-            self._times[self._count] = message.time_ns
-            self._count += 1
-            self._pending.append(value)
-            if len(self._pending) == MOST_PENDING:
-                self._integrate_pending()
+            self._append(message.time_ns, value)
         else:
             # a second reading of one time: its motion belongs to the interval that ends here
             self._integrate_pending()
@@ -141,6 +138,34 @@ class Readings:
             if n:
                 self._bursts -= int(self._burst[n])
                 self._enter(n, self._rows[n] + row)
+
+    def _append(self, time_ns: int, value: Array) -> None:
+        if self._count == len(self._times):
+            self._grow()
+        self._times[self._count] = time_ns
+        self._count += 1
+        self._pending.append(value)
+        if len(self._pending) == MOST_PENDING:
+            self._integrate_pending()
+
+    def _new_part(self, message: OdometryIncrement) -> Array:
+        """The row of an increment after the readings so far; a gap before it is bridged."""
+        twist, cov = log(message.delta), message.cov
+        begin_ns, end_ns, last_ns = message.start_ns, message.time_ns, self.last_ns
+        if begin_ns > last_ns + SAME_NS:
+            self._integrate_pending()
+            n = self._count - 1
+            took = 1e-9 * int(self._times[n] - self._times[n - 1]) if n else 0.0
+            before = self._rows[n, :3] / took if n else None
+            after = twist / (1e-9 * (end_ns - begin_ns))
+            found, spread = bridge(before, after, 1e-9 * (begin_ns - last_ns))
+            self.missing.note_gap(last_ns, begin_ns)
+            self._append(begin_ns, np.concatenate([found, spread.ravel()]))
+        elif begin_ns < last_ns - SAME_NS and end_ns > last_ns:
+            share = (end_ns - last_ns) / (end_ns - begin_ns)
+            twist, cov = share * twist, share * cov
+            self.missing.overlaps += 1
+        return np.concatenate([twist, cov.ravel()])
 
     def _begin(self, source: str, time_ns: int) -> None:
         """Start at the first reading, the origin of `pose`."""

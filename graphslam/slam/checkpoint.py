@@ -43,9 +43,9 @@ _MODULES = (
     "core.mount_covariances", "core.observation_arrays", "core.records", "core.sensor_config",
     "core.sparse_gaussian", "estimation.clock_calibration", "logs.clock", "logs.log_set",
     "mapping.landmark_map", "multi_robot.frame_tree", "multi_robot.relative_frames",
-    "odometry.increment_sums", "odometry.interpolation", "slam.recorded_closures",
-    "slam.repeated_scans", "slam.robot_state", "slam.scan_tracking", "slam.scans_between",
-    "slam.scans_since_keyframe",
+    "odometry.increment_sums", "odometry.interpolation", "odometry.missing_increments",
+    "slam.recorded_closures", "slam.repeated_scans", "slam.robot_state", "slam.scan_tracking",
+    "slam.scans_between", "slam.scans_since_keyframe",
 )  # fmt: skip
 _CLASSES = (
     ("mapping.landmark_map", "LandmarkMap"),

@@ -16,6 +16,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, RobotResult, Step
 from graphslam.odometry.interpolation import IntArray
+from graphslam.odometry.missing_increments import MissingIncrements
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.path_evidence import NO_PATH, PathMisfits
 from graphslam.slam.robot_state import RobotState
@@ -60,6 +61,7 @@ class RobotEvidence:
     motions ended, ``contradicted`` (q,) whether scans contradicted them. ``seen``: what it saw.
     ``parked``: when it stood, by odometry; ``along_walls``: how its scans fit if its path was
     another one there; ``bridged_sigma_m``: of its position where scans were all that told;
+    ``missing``: what increments of its odometry leave out;
     ``lost_ns`` (l, 2): times of consecutive scans that have nothing in common, see `ComparedScans`.
     """
 
@@ -79,6 +81,7 @@ class RobotEvidence:
     parked: tuple[Parked, ...]
     along_walls: PathMisfits = NO_PATH
     bridged_sigma_m: float = 0.0
+    missing: MissingIncrements = field(default_factory=MissingIncrements)
     lost_ns: IntTable = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
 
 
@@ -120,6 +123,7 @@ def gather(
                 readings_ns=run.track.times,
                 readings=run.track.pose(run.track.times),
                 resets=run.track.resets,
+                missing=run.track.missing,
                 stamps_ns=result.final.stamps_ns[some],
                 final=result.final.poses[some],
                 by_odometry=result.dead_reckoning.poses[some],

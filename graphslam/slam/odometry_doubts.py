@@ -32,6 +32,8 @@ CREEP_M_S, CREEPING, STRAIGHT_RAD_S, STRAIGHT = 0.01, 0.5, 0.02, 0.2
 JUMP_M, JUMP_RAD = 0.22, 0.4
 #: s: odometry without a reading for longer is a guess; periods of the topic
 GAP_S, GAP_PERIODS = 3.0, 8.0
+#: share of the time, or of increments, that may be missing, or overlap
+MISSING = 0.1
 #: s: readings that are farther apart do not tell how a robot moved
 SLOW_S = 1.2
 #: s: motions over so long are compared with those of the result
@@ -89,6 +91,7 @@ def _gaps(robot: RobotEvidence) -> Iterator[Reason]:
         yield _reason(robot, "doubtful", f"has a reading every {usual:.1f} s only")
         return
     if robot.source == "given":
+        yield from _left_out(robot)
         return
     if robot.bridged_sigma_m > BRIDGED_SIGMA_M:
         text = (
@@ -106,6 +109,23 @@ def _gaps(robot: RobotEvidence) -> Iterator[Reason]:
             "in which the robot moved"
         )
         yield _reason(robot, "doubtful", text)
+
+
+def _left_out(robot: RobotEvidence) -> Iterator[Reason]:
+    """Increments that are missing while the robot moved, or that overlap."""
+    missing, origin = robot.missing, int(robot.readings_ns[0])
+    whole_ns = int(robot.readings_ns[-1]) - origin
+    gap_s = 1e-9 * missing.longest_ns
+    ends = missing.longest_at_ns + np.array([0, missing.longest_ns])
+    near = robot.readings_ns.searchsorted(ends).clip(0, len(robot.readings) - 1)
+    moved = between(robot.readings[near[0]], robot.readings[near[1]])
+    is_long = gap_s > GAP_S and (np.hypot(*moved[:2]) > MOVED_M or abs(moved[2]) > MOVED_RAD)
+    if (
+        is_long
+        or missing.total_ns > MISSING * whole_ns
+        or missing.overlaps > MISSING * len(robot.readings)
+    ):
+        yield _reason(robot, "doubtful", missing.to_text(origin))
 
 
 def _speed(robot: RobotEvidence) -> Iterator[Reason]:

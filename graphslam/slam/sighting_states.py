@@ -12,7 +12,16 @@ import numpy as np
 
 from graphslam.core.geometry import Array, between, compose, exp, inverse, log, wrap
 from graphslam.core.observation_models import transport
-from graphslam.core.records import Association, Estimate, Motion, Sighting, Start, Step, Trajectory
+from graphslam.core.records import (
+    Association,
+    Closure,
+    Estimate,
+    Motion,
+    Sighting,
+    Start,
+    Step,
+    Trajectory,
+)
 from graphslam.estimation.batch_calibration import uncovered_covs
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.interpolation import IntArray, final_at
@@ -41,11 +50,18 @@ def steps_at_sightings(
         dropped: counts what was left out, by reason.
 
     Returns:
-        Steps whose motions have times alone, and whose associations are as measured.
+        Steps whose motions have times alone, and whose associations are as measured. There are
+        states at the ends of closures too.
     """
     starts: dict[int, dict[str, Start]] = defaultdict(dict)
     seen: dict[int, list[Association]] = defaultdict(list)
+    ends: dict[int, set[str]] = defaultdict(set)
+    closures: dict[int, list[Closure]] = defaultdict(list)
     for step in steps:
+        for closure in step.closures:
+            for robot, time_ns in closure.pair:
+                ends[time_ns].add(robot)
+            closures[max(closure.time_ns, closure.other_time_ns)].append(closure)
         for robot, start in step.starts.items():
             starts[step.time_ns + max(0, late_ns.get(robot, 0))][robot] = start
         for a in step.associations:
@@ -54,21 +70,32 @@ def steps_at_sightings(
                 z, cov = measured_from_base(sighting)
                 seen[sighting.time_ns].append(replace(a, time_ns=sighting.time_ns, z=z, cov=cov))
     latest: dict[str, int] = {}
+    begun: dict[str, int] = {}
     made = []
-    for time_ns in sorted({*starts, *seen}):
+    for time_ns in sorted({*starts, *seen, *ends}):
         if time_ns in starts:
             latest.update(dict.fromkeys(starts[time_ns], time_ns))
+            begun.update(dict.fromkeys(starts[time_ns], time_ns))
             made.append(Step(time_ns, dict(starts[time_ns])))
         own = [a for a in seen.get(time_ns, []) if _robots(a) <= latest.keys()]
         dropped["sighting: no odometry near it"] += len(seen.get(time_ns, [])) - len(own)
+        related = closures.get(time_ns, [])
+        closed = [c for c in related if _has_begun(c, begun)]
+        dropped["relative pose: no odometry near it"] += len(related) - len(closed)
         motions = {}
-        for robot in sorted(set().union(*map(_robots, own))):
+        here = (ends.get(time_ns, set()) & latest.keys()).union(*map(_robots, own))
+        for robot in sorted(here):
             if latest[robot] < time_ns:
                 motions[robot] = timed_motion(latest[robot], time_ns)
                 latest[robot] = time_ns
-        if own:
-            made.append(Step(time_ns, {}, motions, tuple(own)))
+        if own or motions or closed:
+            made.append(Step(time_ns, {}, motions, tuple(own), tuple(closed)))
     return tuple(made)
+
+
+def _has_begun(closure: Closure, begun: Mapping[str, int]) -> bool:
+    """Whether there are states at both ends of a closure; ``begun``: robot -> its first."""
+    return all(robot in begun and begun[robot] <= time_ns for robot, time_ns in closure.pair)
 
 
 def _robots(a: Association) -> set[str]:

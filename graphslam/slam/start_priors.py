@@ -4,12 +4,14 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
-from graphslam.core.geometry import Array
-from graphslam.core.records import Scan, Sighting, Start, Truth
+from graphslam.core.geometry import Array, between, compose, inverse
+from graphslam.core.records import OdometryIncrement, Scan, Sighting, Start, Truth
 from graphslam.logs import LogSet
+from graphslam.odometry.preintegration import Track
+from graphslam.slam.robot_settings import robot_settings
 from graphslam.slam.synchronisation import ODOMETRY
 
-#: ns: a truth sample this near to a robot's first odometry is taken as the truth of its start
+#: ns: a truth sample this near to a robot's first odometry tells where it starts
 MAX_TRUTH_LAG_NS = 500_000_000
 
 
@@ -26,7 +28,7 @@ def start_poses(log: LogSet, config: Config) -> dict[str, Start]:
     starts: dict[str, Start] = {}
     if start.from_truth:
         truth = _cov(start.truth_sigma_m, start.truth_sigma_rad)
-        starts = {robot: Start(pose, truth) for robot, pose in first_truth(log).items()}
+        starts = {robot: Start(pose, truth) for robot, pose in first_truth(log, config).items()}
     for robot, pose in start.poses.items():
         if len(pose) != 3 or robot not in log.robots:
             raise EstimationError(
@@ -56,38 +58,61 @@ def _cov(sigma_m: float, sigma_rad: float) -> Array:
     return np.diag([sigma_m**2, sigma_m**2, sigma_rad**2])
 
 
-def first_truth(log: LogSet) -> dict[str, Array]:
+def first_truth(log: LogSet, config: Config | None = None) -> dict[str, Array]:
     """The true pose (3,) of each robot when its odometry or, without one, its scans begin.
+
+    The sample nearest to that time is moved there by the odometry. ``config``: settings of the
+    robots; the default ones if None.
 
     Raises:
         EstimationError: a robot has no truth within `MAX_TRUTH_LAG_NS` of its first odometry.
     """
+    config = config or Config()
     begins: dict[str, int] = {}
-    nearest: dict[str, Truth] = {}
+    samples: dict[str, list[Truth]] = {name: [] for name in log.robots}
+    tracks = {
+        name: Track(config.odometry, robot_settings(name, config, log.notes)) for name in log.robots
+    }
     by_scans = log.without_odometry
     for message in log.messages((Sighting,) if by_scans else (Scan, Sighting)):
-        if isinstance(message, ODOMETRY) or (
-            isinstance(message, Scan) and message.robot in by_scans
-        ):
+        if isinstance(message, ODOMETRY):
+            # of an increment the time is its end
+            first_ns = message.start_ns if isinstance(message, OdometryIncrement) else None
+            begins.setdefault(message.robot, message.time_ns if first_ns is None else first_ns)
+            tracks[message.robot].add(message)
+        elif isinstance(message, Scan) and message.robot in by_scans:
             begins.setdefault(message.robot, message.time_ns)
-        elif isinstance(message, Truth):
-            known = nearest.get(message.robot)
-            begin = begins.get(message.robot, message.time_ns)
-            if known is None or abs(message.time_ns - begin) < abs(known.time_ns - begin):
-                nearest[message.robot] = message
+        elif isinstance(message, Truth) and message.robot in samples:
+            samples[message.robot].append(message)
         if all(
-            robot in begins and message.time_ns > begins[robot] + MAX_TRUTH_LAG_NS
-            for robot in log.robots
+            robot in begins
+            and message.time_ns > begins[robot] + MAX_TRUTH_LAG_NS
+            and (robot in by_scans or track.reaches(begins[robot] + MAX_TRUTH_LAG_NS))
+            for robot, track in tracks.items()
         ):
             break
-    for robot in log.robots:
-        truth = nearest.get(robot)
-        if truth is None:
+    poses = {}
+    for robot, known in samples.items():
+        if not known:
             raise EstimationError(f"--start truth: the log has no truth for {robot} at its start")
-        begin = begins.get(robot, truth.time_ns)
+        begin = begins.get(robot, known[-1].time_ns)
+        truth = known[int(np.argmin([abs(sample.time_ns - begin) for sample in known]))]
         if abs(truth.time_ns - begin) > MAX_TRUTH_LAG_NS:
             raise EstimationError(
                 f"--start truth: {robot} starts at {begin} ns and its truth nearest to that is of "
                 f"{truth.time_ns} ns; give --start {robot}=x,y,phi"
             )
-    return {robot: nearest[robot].pose for robot in log.robots}
+        poses[robot] = _moved(truth, begin, tracks[robot])
+    return poses
+
+
+def _moved(truth: Truth, begin_ns: int, track: Track) -> Array:
+    """A true pose (3,) at the time when the odometry begins, before which its speed was the same.
+
+    ``track``: the odometry; empty of a robot without.
+    """
+    apart_ns = truth.time_ns - begin_ns
+    if not len(track) or not apart_ns:
+        return truth.pose
+    moved = between(track.pose(begin_ns), track.pose(begin_ns + abs(apart_ns)))
+    return compose(truth.pose, moved if apart_ns < 0 else inverse(moved))

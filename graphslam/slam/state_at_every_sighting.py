@@ -142,7 +142,7 @@ def state_at_every_sighting(
 
 
 def _late_ns(one: LogPass) -> dict[str, int]:
-    """Robot -> by how much its sightings are stamped late, as known now; only what shows clearly."""
+    """Robot -> by how much its sightings are stamped late, where the log shows that clearly."""
     tracks = {name: run.track for name, run in one.started.items()}
     return {
         name: track.reported_late_ns(track.calibration)

@@ -137,6 +137,8 @@ def summarise(
                 "contradicted": run.contradicted,
                 "resets": run.track.resets,
                 "bridged": run.track.bridged,
+                "gaps": run.track.missing.gaps,
+                "overlaps": run.track.missing.overlaps,
             }
             for robot, run in runs.items()
         },
@@ -271,6 +273,11 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         f"{name}: its odometry jumped {run.track.resets} times; bridged at the previous speed"
         for name, run in pipeline.runs.items()
         if run.track.resets
+    ]
+    warnings += [
+        f"{name}: its odometry {text}"
+        for name, run in pipeline.runs.items()
+        if len(run.track) and (text := run.track.missing.to_text(run.track.first_ns))
     ]
     warnings += [
         f"{name}: its odometry is silent while {run.track.bridged} scans were measured; "
