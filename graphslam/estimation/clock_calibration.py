@@ -234,7 +234,10 @@ def _relative_offset(
     if not count:
         return None
     best = int(np.clip(np.argmin(cost), 1, len(offsets) - 2))
-    if cost[len(offsets) // 2] < MIN_COST_RATIO * cost[best]:
+    ratio = cost[len(offsets) // 2] / max(cost[best], 1e-12)
+    # twice the gain in log-likelihood, of which the best of many offsets has a part by chance
+    gain = 2 * count / CORRELATED * np.log(max(ratio, 1.0))
+    if ratio < MIN_COST_RATIO or gain < SIGNIFICANT_SIGMAS**2 + 2 * np.log(len(offsets)):
         return None
     curvature = (cost[best - 1] - 2 * cost[best] + cost[best + 1]) / STEP_S**2
     if curvature <= 0:
