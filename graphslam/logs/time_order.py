@@ -162,7 +162,8 @@ class MessageSorter:
         if message.time_ns != self._seen_ns:
             self._seen_ns, self._seen = message.time_ns, set()
         numbers = (message.z.tobytes(), message.cov.tobytes(), message.mount.tobytes())
-        whole = (message.robot, message.stamp_ns, message.identity, message.seen_robot, *numbers)
+        what = (message.identity, message.seen_robot, message.may_be)
+        whole = (message.robot, message.stamp_ns, *what, *numbers)
         if whole in self._seen:
             return True
         self._seen.add(whole)

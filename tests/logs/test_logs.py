@@ -258,9 +258,9 @@ def test_equal_stamps_are_kept_and_counted_except_sightings_of_one_image(tmp_pat
     path = tmp_path / "log.mcap"
     with LogWriter(path) as log:
         log.odometry("robot", S, (0, 0, 0))
-        for _ in range(3):
+        for k in range(3):
             log.scan("robot", 2 * S, [1, 2, 3], **SCAN)
-            log.sighting("robot", 2 * S, (0, 1), COV2)
+            log.sighting("robot", 2 * S, (0, 1 + k), COV2)
     logs, messages = read(path)
     assert len(messages) == 7 and logs.repaired == {"stamp: duplicate": 2}
 
