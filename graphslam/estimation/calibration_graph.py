@@ -358,19 +358,15 @@ class CalibrationGraph:
         Raises:
             EstimationError: it is indeterminate.
         """
-        free = {robot: key for robot, key in self._keys.items() if len(self._free[robot])}
-        if posterior is not None:
-            known = {robot: posterior.blocks.marginals[key] for robot, key in free.items()}
-        else:
-            joint = self._joint_covariance(list(free.values())) if free else np.zeros((0, 0))
-            ends = np.cumsum([len(self._free[robot]) for robot in free])
-            known = {
-                robot: joint[end - len(self._free[robot]) : end, end - len(self._free[robot]) : end]
-                for robot, end in zip(free, ends.tolist(), strict=True)
-            }
         covs = {robot: prior.cov.copy() for robot, prior in self._priors.items()}
-        for robot, own in known.items():
-            covs[robot][np.ix_(self._free[robot], self._free[robot])] = own
+        for robot, use in self._free.items():
+            if len(use):
+                key = self._keys[robot]
+                if posterior is None:
+                    own = self._joint_covariance([key])
+                else:
+                    own = posterior.blocks.marginals[key]
+                covs[robot][np.ix_(use, use)] = own
         return covs
 
     def landmark_covariance(self, landmarks: Sequence[int]) -> Array:

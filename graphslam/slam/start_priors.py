@@ -77,8 +77,9 @@ def first_truth(log: LogSet, config: Config | None = None) -> dict[str, Array]:
     for message in log.messages((Sighting,) if by_scans else (Scan, Sighting)):
         if isinstance(message, ODOMETRY):
             # of an increment the time is its end
-            first_ns = message.start_ns if isinstance(message, OdometryIncrement) else None
-            begins.setdefault(message.robot, message.time_ns if first_ns is None else first_ns)
+            if isinstance(message, OdometryIncrement):
+                begins.setdefault(message.robot, message.start_ns)
+            begins.setdefault(message.robot, message.time_ns)
             tracks[message.robot].add(message)
         elif isinstance(message, Scan) and message.robot in by_scans:
             begins.setdefault(message.robot, message.time_ns)
