@@ -70,11 +70,16 @@ def causal_at(
         better: rows (m,) where the motion since the state is known better than by odometry, motions
             (m, 3) and their covariances (m, 3, 3) along the axes of the state.
     """
-    i = last
-    delta, noise = track.coarse_motions(states.stamps_ns[i], times_ns, calibrations, i)
+    i, since = last, times_ns - states.stamps_ns[last]
+    delta, noise = np.zeros((len(i), 3)), np.zeros((len(i), 3, 3))
+    by_odometry = since != 0
     if better is not None:
-        rows, motions, covs = better
-        delta[rows], noise[rows] = motions, covs
+        rows, delta[rows], noise[rows] = better
+        by_odometry[rows] = False
+    own = np.flatnonzero(by_odometry)
+    if len(own):  # a live robot mostly has none
+        begin, end = states.stamps_ns[i[own]], times_ns[own]
+        delta[own], noise[own] = track.coarse_motions(begin, end, calibrations, i[own])
     covs = compose_cov(states.poses[i], states.covs[i], delta, noise)
     return Trajectory(stamps_ns, compose(states.poses[i], delta), covs)
 
