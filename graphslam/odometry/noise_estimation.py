@@ -117,6 +117,22 @@ def variance_sigma(redundancy: Array) -> Array:
     return np.asarray(1.0 / np.sqrt(redundancy.sum(axis=0) / 2.0 + PRIOR_LOG_SIGMA**-2))
 
 
+def with_fit_errors(config: OdometryConfig, log_sigma: Array) -> OdometryConfig:
+    """Settings whose noise counts in how well it is known: errors squared are as large on average.
+
+    A variance that ν residuals show is too small as often as too large, and where it is too small
+    errors are out of all proportion: divided by it, they are squared ν / (ν - 2) on average. With
+    few residuals (ν is two over the squared sigma of the logarithm) that is far from 1. The
+    exponential, the same to first order, stays finite where next to nothing is known.
+
+    Args:
+        config: settings as fitted.
+        log_sigma: (3,) of the mean variances along x, y and of turning, see `variance_sigma`.
+    """
+    rates = np.array([getattr(config, name) for name in RATES])
+    return with_rates(config, rates * np.repeat(np.exp(log_sigma**2), 3))
+
+
 def rates_of(twists: Array, seconds: Array, variances: Array) -> Array:
     """The rates (9,), in the order of `RATES`, by which motions have given variances.
 

@@ -7,6 +7,7 @@ themselves, each residual divided by what the solution leaves of its variance.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from graphslam.odometry.noise_estimation import (
     is_stated,
     motion_variances,
     variance_sigma,
+    with_fit_errors,
 )
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
@@ -107,7 +109,20 @@ def scale_motion_noise(steps: Sequence[Step], scales: Mapping[str, Array]) -> tu
     )
 
 
-def fit_track_noise(track: Track, robot: str, posterior: Posterior, *, relax: bool) -> float | None:
+class NoiseFit(NamedTuple):
+    """How far a fit of a track's noise has come.
+
+    ``change``: the largest share by which the mean variance along x, or of turning, has changed, 0
+    where that is `NEGLIGIBLE`; ``log_sigma`` (3,): see `variance_sigma`.
+    """
+
+    change: float
+    log_sigma: Array
+
+
+def fit_track_noise(
+    track: Track, robot: str, posterior: Posterior, *, relax: bool
+) -> NoiseFit | None:
     """Give a track whose noise nobody states that of its motions in a solution.
 
     Motions that scans replaced, or of which readings miss a part, are left out.
@@ -119,8 +134,7 @@ def fit_track_noise(track: Track, robot: str, posterior: Posterior, *, relax: bo
         relax: see `fit_noise`.
 
     Returns:
-        The largest share by which the mean variance along x, or of turning, has changed, 0 where
-        that is `NEGLIGIBLE`; None if there are too few motions.
+        None if there are too few motions.
     """
     own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
     times, solved = _solved(own)
@@ -136,8 +150,9 @@ def fit_track_noise(track: Track, robot: str, posterior: Posterior, *, relax: bo
     track.config = fit_noise(track, used, variances, normalised, left, relax=relax)
     after = motion_variances(track, track.config, used)
     change = np.abs(np.mean(after / variances, axis=0) - 1.0)
-    change[change < NEGLIGIBLE * variance_sigma(left)] = 0.0
-    return float(change[[0, 2]].max())
+    log_sigma = variance_sigma(left)
+    change[change < NEGLIGIBLE * log_sigma] = 0.0
+    return NoiseFit(float(change[[0, 2]].max()), log_sigma)
 
 
 def measured_motion_noise(track: Track, robot: str, posterior: Posterior) -> Array | None:
@@ -162,7 +177,9 @@ def fit_motion_noise(tracks: Mapping[str, Track], posterior: Posterior) -> LogNo
             if found is not None:
                 measured[robot, MOTION] = found
         else:
-            fit_track_noise(track, robot, posterior, relax=False)
+            fit = fit_track_noise(track, robot, posterior, relax=False)
+            if fit is not None:
+                track.config = with_fit_errors(track.config, fit.log_sigma)
     used = {name: track.config for name, track in tracks.items() if (name, MOTION) not in measured}
     return LogNoise(odometry=used, measured=measured)
 

@@ -18,10 +18,10 @@ from graphslam.estimation.calibration_graph import CalibrationGraph
 from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
-from graphslam.odometry.noise_estimation import is_stated, without_floors
+from graphslam.odometry.noise_estimation import is_stated, with_fit_errors, without_floors
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_noise import MOTION, LogNoise, has_state_at_every_sighting, is_white
-from graphslam.slam.motion_noise import fit_track_noise, measured_motion_noise
+from graphslam.slam.motion_noise import NoiseFit, fit_track_noise, measured_motion_noise
 from graphslam.slam.sensor_latency import hold_insignificant_latency
 from graphslam.slam.sighting_states import (
     at_states,
@@ -124,6 +124,7 @@ def _estimated(
     for name in stated:
         tracks[name].config = without_floors(tracks[name].config)
     measured: dict[Source, Array] = {}
+    fits: dict[str, NoiseFit | None] = {}
     for _ in range(rounds):
         initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
@@ -145,11 +146,14 @@ def _estimated(
                 if factors is not None:
                     measured[name, MOTION] = factors
                 continue
-            changed = fit_track_noise(track, name, posterior, relax=is_white(noise))
+            fit = fits[name] = fit_track_noise(track, name, posterior, relax=is_white(noise))
             track.config = without_floors(track.config)
-            change = max(change, changed or 0.0)
+            change = max(change, fit.change if fit else 0.0)
         if change < CONVERGED_SHARE or not is_white(noise):
             break
+    for name, fit in fits.items():
+        if fit is not None:
+            tracks[name].config = with_fit_errors(tracks[name].config, fit.log_sigma)
     for source, found in noise.items():
         measured[source] = found.white + found.shared
     final = {source: _cautious(found, config) for source, found in noise.items()}

@@ -3,11 +3,18 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
 from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.motion_models import RATES
 from graphslam.core.records import OdometryPose, Step
 from graphslam.estimation.posterior_residuals import Residuals
-from graphslam.odometry.noise_estimation import motion_variances
+from graphslam.odometry.noise_estimation import (
+    motion_variances,
+    variance_sigma,
+    with_fit_errors,
+    with_rates,
+)
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.motion_noise import (
     FEW_MOTIONS,
@@ -91,3 +98,16 @@ def test_factors_on_stated_noise_are_those_of_the_log_whatever_it_was_solved_wit
     track, _, steps, stated = driven()
     found = measured_motion_noise(track, "r", Solution(steps, stated))
     np.testing.assert_allclose(found[[0, 2]], FACTOR**2, rtol=0.25)
+
+
+@pytest.mark.parametrize("count", [8, 20])
+def test_errors_are_as_large_on_average_as_noise_that_few_residuals_show(count):
+    """Variances that `count` residuals show, over 40 000 draws. By the likeliest ones errors
+    squared are count / (count - 2) times as large as they should be: 1.33 and 1.11."""
+    rng = np.random.default_rng(0)
+    shown = rng.chisquare(count, size=40_000) / count
+    config = with_rates(OdometryConfig(), np.ones(len(RATES)))
+    wider = with_fit_errors(config, variance_sigma(np.ones((count, 3))))
+    for name in RATES:
+        squared = np.mean(1.0 / (getattr(wider, name) * shown))
+        assert squared == pytest.approx(1.0, abs=0.08)  # higher orders of 1 / count, and a prior

@@ -1,6 +1,6 @@
 """Logs of sightings with the noise that they show: white or shared, stated or not, late or not."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -167,6 +167,19 @@ def test_unstated_noise_of_odometry_is_found(tmp_path):
         each = [rates[f"k_{axis}_{unit}"] for unit in ("m", "rad", "s")]
         # 600 motions, three quarters of whose noise the sightings leave open: 15 %
         assert each @ amounts / len(moved) == pytest.approx(true**2, rel=0.35)
+
+
+def test_noise_that_few_sightings_show_is_not_taken_for_less_than_it_may_be(tmp_path):
+    """One or two points in three seconds, eight draws: by the likeliest noise the mean NEES per
+    degree of freedom is 2.0, by the true noise it is 1. A log has few independent errors: 0.4."""
+    found = []
+    for seed in range(8):
+        world = simulate(seed)
+        few = [one for one in world.seen if one[0] % 30 == 0][::4]
+        world = replace(world, seen=few)
+        result = solved(tmp_path / f"{seed}.mcap", world, increments=False)
+        found.append(judge(result, world)[1])
+    assert 0.4 < np.mean(found) < 1.7
 
 
 def contradicted_motions(result):
