@@ -21,6 +21,8 @@ from graphslam.logs.topics import Topic
 _PLANE = (0, 1, 5)
 #: parts of the log that are looked at; readings in a row in each, at most
 _BLOCKS, _PER_BLOCK = 8, 500
+#: and those that show whether there is anything to look at
+_FEW = 20
 #: m²/s², rad²/s²: variances beyond are placeholders (1e-9, 1e3, 1e6): sigmas of 0.1 mm/s, of 10 m/s
 _LEAST, _MOST = 1e-8, 1e2
 #: share of the readings in motion that must state their noise; how many there must be
@@ -69,12 +71,13 @@ def stated_noise(files: Sequence[Recording], topic: Topic) -> StatedNoise | None
 def _sampled(file: Recording, topic: Topic) -> list[tuple[Array, Array, Array]]:
     """Motions (n, 3) between readings in a row, seconds (n,), covariances (n, 3, 3) of velocity.
 
-    Empty if the first message states none, as most do not: then no more is read.
+    Empty if none of some messages states any, as most do not: then no more is read. The first of them
+    may be from before the driver has its covariances.
     """
-    first = next(sample_messages(file, topic.name, 1, 1), None)
+    few = list(sample_messages(file, topic.name, _BLOCKS, _FEW))
     context = TopicContext(topic.robot)
     try:
-        if first is None or not _covariances([first]).any():
+        if not few or not _covariances(few).any():
             return []
         data = list(sample_messages(file, topic.name, _BLOCKS, _PER_BLOCK))
         readings = odometry(schemas.odometry_table(data), context)

@@ -39,6 +39,12 @@ def test_noise_of_velocities_becomes_that_of_motions(tmp_path):
     assert track.config.k_phi_s == pytest.approx(SENSIBLE[2] * 0.1, rel=0.01)
 
 
+def test_first_messages_may_state_no_noise(tmp_path):
+    """A driver that has no covariances yet. Two readings of 200: nine tenths of them state it."""
+    log = log_of(tmp_path / "log.mcap", lambda k: SENSIBLE if k > 1 else (0.0, 0.0, 0.0))
+    assert log.stated_noise("robot") is not None
+
+
 def test_noise_that_grows_with_speed_is_fitted_as_such(tmp_path):
     def growing(k):
         return tuple((1e-4 + 1e-3 * abs(np.sin(k)) * (np.array([1.0, 1.0, 4.0]))).tolist())
