@@ -71,8 +71,8 @@ def stated_noise(files: Sequence[Recording], topic: Topic) -> StatedNoise | None
 def _sampled(file: Recording, topic: Topic) -> list[tuple[Array, Array, Array]]:
     """Motions (n, 3) between readings in a row, seconds (n,), covariances (n, 3, 3) of velocity.
 
-    Empty if none of some messages states any, as most do not: then no more is read. The first of them
-    may be from before the driver has its covariances.
+    Empty if none of some messages states any, as most do not: then no more is read. The first of
+    them may be from before the driver has its covariances.
     """
     few = list(sample_messages(file, topic.name, _BLOCKS, _FEW))
     context = TopicContext(topic.robot)

@@ -36,7 +36,8 @@ class Seen:
     ``targets`` numbers what is seen, ``stands`` says that it is a landmark; ``z`` (n, 2) is bearing
     rad and range m of ``sigmas`` (n, 2); ``odometry`` (n, 3) the poses that they were made from by
     odometry alone, ``poses`` (n, 3) the same in the result; ``d2`` their squared distances from
-    the result, per degree of freedom.
+    the result, per degree of freedom. ``names``: those of the targets, in the order of their
+    numbers; "" for robots and for landmarks without.
     """
 
     times_ns: IntArray
@@ -47,6 +48,7 @@ class Seen:
     odometry: Array
     poses: Array
     d2: Array
+    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,6 +112,7 @@ def gather(
 ) -> Evidence:
     """The evidence of a run: the last pass, and its result, see `graphslam.core.records.Result`."""
     found = []
+    identities = {i: one.identity or "" for i, one in pipeline.landmarks.entries.items()}
     by_scans = pipeline.scan_evidence or gather_scan_evidence(pipeline, estimate)
     for name, run in pipeline.started.items():
         motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
@@ -131,7 +134,7 @@ def gather(
                 repeated_ns=np.array(run.repeats.left_out, dtype=np.int64).reshape(-1, 2),
                 motions_ns=np.array([time for time, _ in motions], dtype=np.int64),
                 contradicted=np.array([was for _, was in motions], dtype=bool),
-                seen=_seen(seen, run, estimate),
+                seen=_seen(seen, run, estimate, identities),
                 parked=by_scans[name].parked,
                 along_walls=by_scans[name].along_walls,
                 bridged_sigma_m=run.track.bridged_sigma_m,
@@ -143,13 +146,18 @@ def gather(
     return Evidence(tuple(found), summary, innovations, by_scans_alone, observed)
 
 
-def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> Seen:
+def _seen(
+    seen: Sequence[Association],
+    run: RobotState,
+    estimate: Estimate,
+    identities: Mapping[int | str, str],
+) -> Seen:
     usable = [a for a in seen if _target(a, estimate) is not None]
     usable.sort(key=lambda a: a.time_ns)
     n = len(usable)
     times = np.array([a.time_ns for a in usable], dtype=np.int64)
-    names: dict[int | str, int] = {}
-    targets = np.array([names.setdefault(a.target, len(names)) for a in usable], dtype=np.int64)
+    numbers: dict[int | str, int] = {}
+    targets = np.array([numbers.setdefault(a.target, len(numbers)) for a in usable], dtype=np.int64)
     z = np.array([a.z for a in usable]).reshape(n, 2)
     covs = np.array([a.cov for a in usable]).reshape(n, 2, 2)
     d2 = np.zeros(n)
@@ -168,6 +176,7 @@ def _seen(seen: Sequence[Association], run: RobotState, estimate: Estimate) -> S
         run.track.mounted_pose(times) if n else np.zeros((0, 3)),
         estimate.states[usable[0].robot].at(times) if n else np.zeros((0, 3)),
         d2,
+        tuple(identities.get(target, "") for target in numbers),
     )
 
 

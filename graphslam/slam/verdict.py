@@ -12,6 +12,7 @@ from typing import Any
 
 from graphslam.slam.doubts import Reason
 from graphslam.slam.evidence import Evidence
+from graphslam.slam.moved_points import moved_doubts
 from graphslam.slam.odometry_doubts import odometry_doubts
 from graphslam.slam.scan_doubts import scan_doubts
 from graphslam.slam.sighting_doubts import sighting_doubts
@@ -173,6 +174,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "scans": scan_doubts,
     "sightings": sighting_doubts,
     "points": vanished_doubts,
+    "moved": moved_doubts,
     "noise": _noise,
     "residuals": _misfit,
     "rejected": _rejected,
