@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.gaussian import mahalanobis_squared
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, RobotResult, Step
 from graphslam.odometry.interpolation import IntArray
@@ -27,6 +27,8 @@ IntTable = np.ndarray[tuple[int, int], np.dtype[np.int64]]
 
 #: poses of a trajectory that are compared, at most
 MOST_POSES = 4000
+#: m: a closure says nothing along a direction in which its sigma is larger
+OPEN_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +51,20 @@ class Seen:
     poses: Array
     d2: Array
     names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosureMisfits:
+    """Closures (n) against the result: by how far they miss it.
+
+    ``times_ns`` (n, 2): when the robot was there, and when it, or another one, was there before.
+    ``off_m`` (n,): between where they and where the result have the one place from the other, as
+    far as they know that; ``d2`` (n,): squared distances, for three degrees of freedom.
+    """
+
+    times_ns: IntTable
+    off_m: Array
+    d2: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,7 +108,7 @@ class Evidence:
     """What the whole run knows; ``summary`` has what it counted.
 
     ``without_odometry``: robots whose motion is that of their scans. ``observed``: whether an
-    observation or a closure is in the estimate.
+    observation or a closure is in the estimate. ``closures``: how well these fit; None without.
     """
 
     robots: tuple[RobotEvidence, ...]
@@ -100,6 +116,7 @@ class Evidence:
     innovations: Mapping[str, Array] = field(default_factory=dict)
     without_odometry: tuple[str, ...] = ()
     observed: bool = True
+    closures: ClosureMisfits | None = None
 
 
 def gather(
@@ -112,7 +129,8 @@ def gather(
 ) -> Evidence:
     """The evidence of a run: the last pass, and its result, see `graphslam.core.records.Result`."""
     found = []
-    identities = {i: one.identity or "" for i, one in pipeline.landmarks.entries.items()}
+    entries = pipeline.landmarks.entries.items()
+    identities: dict[int | str, str] = {i: one.identity or "" for i, one in entries}
     by_scans = pipeline.scan_evidence or gather_scan_evidence(pipeline, estimate)
     for name, run in pipeline.started.items():
         motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
@@ -143,7 +161,27 @@ def gather(
         )
     observed = any(step.associations or step.closures for step in steps)
     by_scans_alone = tuple(pipeline.log.without_odometry)
-    return Evidence(tuple(found), summary, innovations, by_scans_alone, observed)
+    misfits = _closure_misfits(steps, estimate)
+    return Evidence(tuple(found), summary, innovations, by_scans_alone, observed, misfits)
+
+
+def _closure_misfits(steps: Sequence[Step], estimate: Estimate) -> ClosureMisfits | None:
+    """Of all closures in ``steps``; None without any."""
+    closures = [closure for step in steps for closure in step.closures]
+    if not closures:
+        return None
+    here = np.array([estimate.states[c.robot].at(c.time_ns) for c in closures])
+    there = np.array([estimate.states[c.other].at(c.other_time_ns) for c in closures])
+    off = between(there, here) - np.array([c.delta for c in closures])
+    off[:, 2] = wrap(off[:, 2])
+    pull = np.linalg.solve(np.array([c.cov for c in closures]), off[:, :, None])[:, :, 0]
+    # of a direction that is open nothing is known, however far off it is
+    known = np.array([np.sqrt(np.diag(c.cov)[:2]) < OPEN_M for c in closures])
+    return ClosureMisfits(
+        np.array([[c.time_ns, c.other_time_ns] for c in closures], dtype=np.int64),
+        np.hypot(*(off[:, :2] * known).T),
+        np.sum(off * pull, axis=1),
+    )
 
 
 def _seen(

@@ -23,7 +23,7 @@ APART = 5.0
 
 def moved_doubts(evidence: Evidence) -> Iterator[Reason]:
     """Named points whose earlier and later sightings, of all robots, agree on different places."""
-    parts: dict[str, list[tuple[Array, ...]]] = defaultdict(list)
+    parts: dict[str, list[tuple[IntArray, Array, Array]]] = defaultdict(list)
     for robot in evidence.robots:
         for name, part in _by_name(robot.seen):
             parts[name].append(part)
@@ -53,7 +53,7 @@ class _Move:
     first_ns: int
 
 
-def _by_name(seen: Seen) -> Iterator[tuple[str, tuple[Array, ...]]]:
+def _by_name(seen: Seen) -> Iterator[tuple[str, tuple[IntArray, Array, Array]]]:
     """Each named point with times (n,) of its sightings, their places (n, 2), and weights (n,)."""
     at = transform_each(seen.poses, polar_points(seen.z[:, 1], seen.z[:, 0]))
     across = seen.z[:, 1] * seen.sigmas[:, 0]

@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
-from graphslam.slam.doubts import Reason
+import numpy as np
+
+from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence
 from graphslam.slam.moved_points import moved_doubts
 from graphslam.slam.odometry_doubts import odometry_doubts
@@ -22,6 +24,10 @@ from graphslam.slam.vanished_points import vanished_doubts
 NOISE_FACTORS = 30.0, 1000.0
 #: squared residuals per degree of freedom without kernels: of healthy logs up to 2
 MISFITS = 8.0, 100.0
+#: squared distance of a closure, three degrees of freedom: of healthy logs up to 6
+CONTRADICTED_CLOSURE = 50.0
+#: pairs of places that are not joined though they look the same, and their share of all such pairs
+REFUSED = 4, 0.1
 #: share of observations that fit nowhere
 REJECTED = 0.6
 #: share of messages that are lost
@@ -113,6 +119,30 @@ def _misfit(evidence: Evidence) -> Iterable[Reason]:
         yield Reason(level, "residuals", "", text)
 
 
+def _closures(evidence: Evidence) -> Iterable[Reason]:
+    """A path that comes back elsewhere than where its scans, or the log, say that it is."""
+    counts = evidence.summary.get("consolidated") or {}
+    refused, verified = (counts.get(f"closures_{which}", 0) for which in ("refused", "verified"))
+    if refused >= REFUSED[0] and refused > REFUSED[1] * (refused + verified):
+        text = (
+            f"{refused} of {refused + verified} pairs of places that look the same are not joined, "
+            "as all else contradicts that: odometry slipped, or much of the place is alike"
+        )
+        yield Reason("doubtful", "closures", "", text)
+    found = evidence.closures
+    if found is None or not (found.d2 > CONTRADICTED_CLOSURE).any():
+        return
+    worst = int(np.argmax(found.d2))
+    first_ns = min(int(robot.readings_ns[0]) for robot in evidence.robots)
+    here, there = (seconds(int(time), first_ns) for time in found.times_ns[worst])
+    text = (
+        f"the places at {here} and {there} are the same, but the path between them does not lead "
+        f"back by {found.off_m[worst]:.2f} m: odometry slipped where no wall shows it, or they are "
+        "two places that look alike"
+    )
+    yield Reason("doubtful", "closures", "", text)
+
+
 def _rejected(evidence: Evidence) -> Iterable[Reason]:
     rejected = sum(evidence.summary["rejected"].values())
     used = evidence.summary["counts"]["observations"]
@@ -177,6 +207,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "moved": moved_doubts,
     "noise": _noise,
     "residuals": _misfit,
+    "closures": _closures,
     "rejected": _rejected,
     "lost": _lost,
     "unplaced": _unplaced,

@@ -9,7 +9,7 @@ from command_line import call
 
 from graphslam.core.geometry import between, compose, polar_points, transform_each
 from graphslam.logs import LogWriter
-from graphslam.slam.evidence import Evidence, RobotEvidence, Seen
+from graphslam.slam.evidence import ClosureMisfits, Evidence, RobotEvidence, Seen
 from graphslam.slam.path_evidence import FACTORS, PathMisfits
 from graphslam.slam.scan_evidence import Parked, _half_changed
 from graphslam.slam.verdict import judge, with_truth
@@ -162,7 +162,7 @@ def mapped_twice(own):
 def moved_point(own):
     """From half of the log on the point p3 is 1.2 m away, as seen from a path that is right."""
     late = (own.targets == 3) & (own.times_ns > S + 30 * S)
-    at = transform_each(own.poses, polar_points(own.z[:, 1], own.z[:, 0])) + [0.0, 1.2]
+    at = transform_each(own.poses, polar_points(own.z[:, 1], own.z[:, 0])) + np.array([0.0, 1.2])
     x, y = between(own.poses, np.column_stack([at, 0 * at[:, 0]]))[:, :2].T
     moved = np.column_stack([np.arctan2(y, x), np.hypot(x, y)])
     d2 = np.where(late, 1e4, own.d2)
@@ -415,6 +415,24 @@ def test_what_is_wrong_is_said_as_what_it_is(name):
 def test_counts_of_the_run_are_judged(change, level, text):
     verdict, told = reasons(replace(evidence(), summary=SUMMARY | change))
     assert verdict == level and text in told
+
+
+def test_a_closure_that_the_path_misses_is_doubted_and_one_that_leaves_a_direction_open_is_not():
+    """A robust kernel bears it: 1 m of slip along a corridor bent no path, and nobody was told."""
+    times = np.array([[S + 50 * S, S], [S + 40 * S, S + 2 * S]])
+    fits = ClosureMisfits(times, np.array([0.02, 0.0]), np.array([4.0, 1e-3]))
+    assert reasons(replace(evidence(), closures=fits)) == ("good", "")
+    verdict, told = reasons(
+        replace(evidence(), closures=replace(fits, off_m=fits.off_m + 1.0, d2=fits.d2 + 900.0))
+    )
+    assert verdict == "doubtful" and "the places at 50.0 s and 0.0 s are the same" in told
+
+
+@pytest.mark.parametrize(("refused", "verdict"), [(3, "good"), (6, "doubtful")])
+def test_places_that_look_the_same_and_are_not_joined_are_doubted(refused, verdict):
+    """Of 20 laps through a building with some rooms that are alike a few are to be expected."""
+    counts = {"consolidated": {"closures_refused": refused, "closures_verified": 26}}
+    assert reasons(replace(evidence(), summary=SUMMARY | counts))[0] == verdict
 
 
 def test_the_truth_in_a_log_is_a_witness_where_it_is():
