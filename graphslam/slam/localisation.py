@@ -94,6 +94,8 @@ def start_as_given(
         what = f"{np.hypot(off[0], off[1]):.2f} m and {np.degrees(abs(off[2])):.1f}°"
         wrong = f"the start that was told is {what} from where the map has it, and was not used"
         said = f"{wrong}; {said}" if said else wrong
+    if not placed.confirmed.any():
+        said = "no place of it is recognised; the log is where its start was told to be"
     scan_log.map_doubt = said
     return (laid_start(laid, robot) if placed.confirmed.any() else given), laid
 

@@ -118,6 +118,16 @@ def test_a_start_that_is_told_wrong_does_not_move_the_map(tmp_path, off_m, doubt
     assert (result.summary["verdict"]["verdict"] == "doubtful") == doubted
 
 
+def test_a_start_beside_the_map_is_a_doubt(tmp_path, first_day):
+    """A sign mistaken. Nothing of the map is seen, so nothing contradicts it either."""
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.3, seed=3)
+    told = true_pose(0.0, 0.3) + np.array([60.0, -40.0, 0.0])
+    found = localised(log, first_day, **{"start.poses.robot": told.tolist()}).summary
+    assert found["known_map"]["seen"] == 0
+    assert found["verdict"]["verdict"] == "doubtful"
+    assert "no place of it is recognised" in found["verdict"]["reasons"][0]["text"]
+
+
 def test_the_map_of_a_localised_result_is_the_earlier_one(tmp_path, first_day):
     """Localisation alone leaves the map as it was; a continued one names its parent."""
     log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.4, seed=4)
