@@ -35,11 +35,12 @@ def drive(
     phase=0.0,
     room=ROOM,
     seed=7,
+    odometry_from=0.0,
 ):
     """A log of the room with two scans a second; odometry errs by 3 % and drifts by 0.02 rad/m.
 
     ``ranges`` may spoil scan number k. ``rear``: with a second laser, at `REAR`.
-    ``phase``: see `true_pose`.
+    ``phase``: see `true_pose`. ``odometry_from``: s after which there is any.
     """
     rng = np.random.default_rng(seed)
     odometry = np.zeros(3)
@@ -54,7 +55,8 @@ def drive(
                 path_m = np.hypot(*moved[:2])
                 moved = moved * [1.03, 1.0, 1.0] + [0, 0, 0.02 * path_m]
                 odometry = compose(odometry, moved + rng.normal(0, 2e-4, 3))
-            log.odometry(robot, stamp, odometry)
+            if k / 10 >= odometry_from:
+                log.odometry(robot, stamp, odometry)
             if truth:
                 log.truth(robot, stamp, pose)
             if k % 5 == 0:

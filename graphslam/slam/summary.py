@@ -39,6 +39,9 @@ REOPTIMISED = (
     "observations_by_loose_returns",
 )
 
+#: share of the scans without odometry from which on there is a warning
+UNPLACED = 0.02
+
 
 def summarise(
     pipeline: LogPass,
@@ -245,6 +248,17 @@ def _apart(pipeline: LogPass) -> list[str]:
     return [name for name, run in runs if run.started and name == of[name] != known.world]
 
 
+def _unplaced_warnings(pipeline: LogPass) -> list[str]:
+    """Scans without odometry, of which nothing is in the result: mostly where that is missing."""
+    count, used = pipeline.dropped["scan: no odometry near it"], pipeline.counts["scans"]
+    if count <= UNPLACED * (count + used):
+        return []
+    return [
+        f"{count} of {count + used} scans were left out: no odometry is near them, as where it "
+        "begins late"
+    ]
+
+
 def _why_apart(pipeline: LogPass, robot: str) -> str:
     undecided = pipeline.known.frame_assignment.undecided
     return undecided.get(robot, "nothing in the log tells its start pose")
@@ -304,6 +318,7 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         and replace(robot_settings(name, pipeline.config, pipeline.log.notes), outline=())
         == RobotConfig()
     ]
+    warnings += _unplaced_warnings(pipeline)
     if not pipeline.config.tracks_scans:
         warnings += [
             f"{topic.robot}: {topic.name} is not used: of several lasers only backend batch uses "

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.logs.time_order import TOO_LATE
 from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence
 from graphslam.slam.moved_points import moved_doubts
@@ -160,6 +161,13 @@ def _lost(evidence: Evidence) -> Iterable[Reason]:
         elif lost > LOST * (lost + read):
             text = f"{log['path']}: {lost} of {lost + read} messages are lost"
             yield Reason("doubtful", "lost", log["path"], text)
+    late = evidence.summary["dropped"].get(TOO_LATE, 0)
+    if late > LOST * sum(log["messages"] for log in evidence.summary["logs"]):
+        text = (
+            f"{late} messages were left out, as they came later than logs.reorder_s allows; see "
+            "graphslam info"
+        )
+        yield Reason("doubtful", "lost", "", text)
 
 
 def _unplaced(evidence: Evidence) -> Iterable[Reason]:

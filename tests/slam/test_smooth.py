@@ -10,8 +10,10 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from paths import ROOT
 from pose_checks import assert_same_pose
+from room_log import drive
 from walls import cast, rectangles
 
+import graphslam
 from graphslam.core.config import Config, OdometryConfig, RobotConfig, StartConfig
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import EstimationError, GraphSlamError
@@ -595,3 +597,12 @@ def test_no_measurement_tells_the_direction_of_the_world():
     sigmas = np.sqrt(np.diagonal(result.estimate.states["vehicle"].covs, axis1=1, axis2=2))
     assert sigmas[0, 2] == pytest.approx(0.5, rel=1e-3)
     assert np.all(sigmas[:, 2] > 0.499)  # the wheels and walls add to it
+
+
+def test_scans_before_the_odometry_begins_are_left_out_with_a_warning(tmp_path):
+    """A sixth of a log went without a word."""
+    log = drive(tmp_path / "late.mcap", odometry_from=5.0)
+    warnings = graphslam.smooth(log).summary["warnings"]
+    assert any("10 of 61 scans were left out: no odometry is near them" in w for w in warnings)
+    every = graphslam.smooth(drive(tmp_path / "all.mcap")).summary["warnings"]
+    assert not any("left out" in warning for warning in every)

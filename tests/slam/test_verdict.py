@@ -9,6 +9,7 @@ from command_line import call
 
 from graphslam.core.geometry import between, compose, polar_points, transform_each
 from graphslam.logs import LogWriter
+from graphslam.logs.time_order import TOO_LATE
 from graphslam.slam.evidence import ClosureMisfits, Evidence, RobotEvidence, Seen
 from graphslam.slam.path_evidence import FACTORS, PathMisfits
 from graphslam.slam.scan_evidence import Parked, _half_changed
@@ -404,6 +405,7 @@ def test_what_is_wrong_is_said_as_what_it_is(name):
         ({"rejected": {"why": 4000}}, "doubtful", "4000 of 4500 observations"),
         ({"logs": [{"path": "x", "lost": 9, "messages": 91}]}, "doubtful", "9 of 100 messages"),
         ({"logs": [{"path": "x", "lost": None, "messages": 91}]}, "doubtful", "nobody knows"),
+        ({"dropped": {TOO_LATE: 30}}, "doubtful", "30 messages were left out, as they came later"),
         ({"dropped": {"scan: no odometry near it": 50}}, "doubtful", "50 of 150 scans were left"),
         ({"dropped": {"sighting: no odometry near it": 300}}, "doubtful", "300 of 800 sightings"),
         ({"sessions": {"apart": {"day1": "why"}}}, "doubtful", "day1: is no part of the map: why"),
