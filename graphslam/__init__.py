@@ -292,7 +292,7 @@ def evaluate(
     Raises:
         OutputError: ``result`` is no result folder, a file cannot be read, or nothing in it can be
             compared.
-        LogError: a log cannot be read or holds no truth.
+        LogError: a log cannot be read, or none holds any truth.
     """
     from graphslam.evaluation.ground_truth import truth_given, truth_of_run
     from graphslam.evaluation.metrics import evaluate
@@ -303,7 +303,7 @@ def evaluate(
         result = load_result(result)
     reference = relations_given(relations)
     if truth is not None:
-        known = truth_given(truth, tuple(result.robots))
+        known = truth_given(truth, tuple(result.robots), result.config)
     else:
         known = truth_of_run(result) if reference is None else GroundTruth({}, ())
     return evaluate(result, known.trajectories, known.landmarks, reference)
@@ -362,7 +362,7 @@ def compare(
         settled,
         rows,
         mode,
-        truth=truth_of_logs(log) if truth is None else truth_given(truth, log.robots),
+        truth=truth_of_logs(log) if truth is None else truth_given(truth, log.robots, settled),
         relations=relations_given(relations),
         progress=of_all(log, progress),
         say=announce,

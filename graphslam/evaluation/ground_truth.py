@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,13 @@ from graphslam.core.errors import LogError, OutputError
 from graphslam.core.records import Result, Trajectory, TrueLandmark, Truth
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import GroundTruth, LogSet, is_recording, read_truth, truth_from_recordings
+from graphslam.logs.sessions import open_recordings
+from graphslam.logs.topics import find_topics
 from graphslam.results.file_formats import read_trajectory
 from graphslam.results.folder import SavedResult
 from graphslam.slam.verdict import with_truth
 
-_NO_TRUTH = "holds no true poses or landmarks; give --truth or --relations"
+_NO_TRUTH = "holds no true poses or landmarks; give"
 
 
 def truth_of_logs(log: LogSet) -> GroundTruth:
@@ -38,39 +41,59 @@ def truth_of_run(result: Result | SavedResult) -> GroundTruth:
         if log["sha256"] != sha256:
             raise LogError(f"{log['path']}: is not the log that was smoothed; give --truth")
     if not found:
-        raise LogError(f"{', '.join(log['path'] for log in logs)}: {_NO_TRUTH}")
+        paths = ", ".join(log["path"] for log in logs)
+        raise LogError(f"{paths}: {_NO_TRUTH} --truth or --relations")
     return found
 
 
-def truth_of_files(sources: Sequence[str], robots: Sequence[str]) -> GroundTruth:
+def truth_of_files(sources: Sequence[str], robots: Sequence[str], config: Config) -> GroundTruth:
     """Truth from recordings and TUM files (``FILE.tum``, ``ROBOT=FILE.tum``).
 
     Args:
         sources: files as given on the command line; what they hold is combined.
         robots: names of the result's robots; with only one, a TUM file needs no name.
+        config: settings of the result; by those of ``logs`` robots and sessions have their names.
 
     Raises:
-        LogError: a log cannot be read or holds no truth.
+        LogError: a log cannot be read, or none of them holds any truth.
         OutputError: a TUM file cannot be read, or it is not clear of which robot it is.
     """
-    trajectories: dict[str, Trajectory] = {}
-    landmarks: list[TrueLandmark] = []
+    recordings, trajectories = [], dict[str, Trajectory]()
     for source in sources:
         if source.endswith(".mcap") or is_recording(Path(source)):
-            found = read_truth([Path(source)], Config())
-            if not found:
-                raise LogError(f"{source}: {_NO_TRUTH}")
-            trajectories |= found.trajectories
-            landmarks += found.landmarks
+            recordings.append(Path(source))
         else:
             robot, path = _robot_and_path(source, robots)
             trajectories[robot] = read_trajectory(path)
-    return GroundTruth(trajectories, tuple(landmarks))
+    if not recordings:
+        return GroundTruth(trajectories, ())
+    found = _truth_in(recordings, config)
+    if not found:
+        raise LogError(f"{', '.join(map(str, recordings))}: {_NO_TRUTH} a file that does")
+    return replace(found, trajectories={**found.trajectories, **trajectories})
+
+
+def _truth_in(recordings: Sequence[Path], config: Config) -> GroundTruth:
+    """The truth in recordings, of robots that are named as ``config`` names those of a result."""
+    logs = config.logs
+    if logs.same_place and len(recordings) > 1:
+        return read_truth(recordings, config)
+    # a recording by itself is no session, but may hold the truth of several
+    every = replace(config, logs=replace(logs, same_place=False, topics={}))
+    files, every = open_recordings(recordings, every)
+    # `logs.topics` is about the logs of the run: these may lack a topic, or have others
+    names = {
+        topic.name: logs.topics.get(topic.name, topic.robot)
+        for topic in find_topics(files, every)
+        if topic.record in (Truth, TrueLandmark)
+    }
+    return truth_from_recordings(files, replace(every, logs=replace(every.logs, topics=names)))
 
 
 def truth_given(
     truth: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | GroundTruth,
     robots: Sequence[str],
+    config: Config,
 ) -> GroundTruth:
     """Truth as a caller gives it: already read, or one or several of `truth_of_files`.
 
@@ -80,7 +103,7 @@ def truth_given(
     if isinstance(truth, GroundTruth):
         return truth
     sources = [truth] if isinstance(truth, str | os.PathLike) else truth
-    return truth_of_files([os.fspath(source) for source in sources], robots)
+    return truth_of_files([os.fspath(source) for source in sources], robots, config)
 
 
 def errors_of_run(result: Result, truth: GroundTruth) -> dict[str, Any] | None:

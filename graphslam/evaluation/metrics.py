@@ -63,7 +63,8 @@ def evaluate(
     of one place that share its frame.
 
     Raises:
-        OutputError: no pose lies within the truth's span, or relations come without scans.
+        OutputError: the truth is of other robots, no pose lies within its span, or relations come
+            without scans.
     """
     found: dict[str, Any] = {}
     alignment = None
@@ -128,7 +129,16 @@ def _compare_landmarks(
 def _pair_all(
     result: Result | SavedResult, truth: Mapping[str, Trajectory]
 ) -> dict[str, dict[str, PosePairs]]:
-    """Robot -> ``final`` and, if there are any, ``causal`` poses with their true ones."""
+    """Robot -> ``final`` and, if there are any, ``causal`` poses with their true ones.
+
+    Raises:
+        OutputError: the truth is of other robots, or of another time.
+    """
+    if not set(truth) & set(result.robots):
+        raise OutputError(
+            f"the truth is of {', '.join(truth)}, the result of {', '.join(result.robots)}; name "
+            "the robot with --truth ROBOT=FILE.tum"
+        )
     pairs = {
         name: {
             kind: pair_poses(path, truth[name])
@@ -141,8 +151,8 @@ def _pair_all(
     pairs = {name: both for name, both in pairs.items() if all(map(len, both.values()))}
     if not pairs:
         raise OutputError(
-            f"no pose of {', '.join(result.robots)} lies within the span of the truth, "
-            f"which is of {', '.join(truth)}"
+            f"no pose of {', '.join(result.robots)} lies within the span of the truth of "
+            f"{', '.join(truth)}"
         )
     return pairs
 

@@ -403,7 +403,10 @@ BAD_TRUTH = {
     "no relations": (("--relations", "missing"), "missing: cannot be read"),
     "bad TUM": (("--truth", "bad"), "bad:1: expected 8 numbers, got 9"),
     "TUM of a stranger": (("--truth", "nobody=bad"), "of which robot is it"),
-    "a log without truth": (("--truth", "log.mcap"), "log.mcap: holds no true poses"),
+    "a log without truth": (
+        ("--truth", "log.mcap"),
+        "log.mcap: holds no true poses or landmarks; give a file",
+    ),
 }
 
 

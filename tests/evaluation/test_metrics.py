@@ -533,9 +533,10 @@ def test_truth_of_another_time_or_robot_is_one_line(tmp_path):
     result, truths, _ = orchard(keyframes=30, trees=5)
     save(result, tmp_path / "out", force=False)
     saved = load(tmp_path / "out")
-    for truth in ({"robot9": truths["robot1"]}, {"robot1": circle(5, start_ns=0)}):
-        with pytest.raises(OutputError, match="within the span of the truth"):
-            evaluate(saved, truth)
+    with pytest.raises(OutputError, match="within the span of the truth"):
+        evaluate(saved, {"robot1": circle(5, start_ns=0)})
+    with pytest.raises(OutputError, match=r"truth is of robot9, the result of robot1"):
+        evaluate(saved, {"robot9": truths["robot1"]})
     with pytest.raises(OutputError, match="has none"):
         evaluate(saved, relations=Relations(np.array([1]), np.array([2]), np.zeros((1, 3))))
     assert evaluate(saved) == {}
