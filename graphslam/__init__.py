@@ -354,8 +354,9 @@ def compare(
 
     settled = settle(recording, config, settings)
     rows = parse_variants(backends.split(",") if isinstance(backends, str) else backends, settled)
+    before = None
     if output is not None:
-        check_target(Path(output), force=force, replaceable=is_comparison)
+        before = check_target(Path(output), force=force, replaceable=is_comparison)
     log = opened(recording, settled)
     comparison = compare(
         log,
@@ -368,7 +369,7 @@ def compare(
         say=announce,
     )
     if output is not None:
-        save_comparison(comparison, settled, Path(output), force=force)
+        save_comparison(comparison, settled, Path(output), force=force, before=before)
     return comparison
 
 
@@ -403,13 +404,14 @@ def changes_between(
     from graphslam.change_detection.folder import check_changes_target
 
     chosen = load_config(config, **settings).changes
+    before = None
     if output is not None:
-        check_changes_target(Path(output), force=force)
+        before = check_changes_target(Path(output), force=force)
     names = (Path(reference).name, Path(later).name)
     found = changes_between(Path(reference), Path(later), chosen, reference_span_s, later_span_s)
     if output is not None:
         page = partial(render_changes, config=chosen, names=names)
-        save_changes(found, Path(output), force=force, report=page)
+        save_changes(found, Path(output), force=force, report=page, before=before)
     return found
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 from graphslam.change_detection.detect import ChangeResult, detect_changes, identity_registration
 from graphslam.change_detection.export import write_mcap, write_overlay_map
@@ -81,15 +82,18 @@ def save_changes(
     *,
     force: bool,
     report: Callable[[ChangeResult], str] | None = None,
+    before: Identity | Literal["now"] = "now",
 ) -> None:
     """Write the folder of docs/formats.md, with report.html if ``report`` renders one.
 
-    It appears whole or not at all.
+    It appears whole or not at all. ``before``: what `check_changes_target` found when the work
+    began, which alone may be replaced.
 
     Raises:
         OutputError: the target exists and may not be replaced, or the disk refuses.
     """
-    before = check_changes_target(directory, force=force)
+    if before == "now":
+        before = check_changes_target(directory, force=force)
     texts = {"changes.json": to_json(found.to_dict(), "changes.json")}
     if report is not None:
         texts["report.html"] = report(found)

@@ -88,13 +88,18 @@ def identity(path: Path) -> Identity:
     return found.st_dev, found.st_ino, found.st_mtime_ns
 
 
+def _is_same(target: Path, before: Identity) -> bool:
+    """Whether nobody wrote ``target`` since `identity` gave ``before``."""
+    return identity(target) in (None, before)
+
+
 def check_same(target: Path, before: Identity) -> None:
     """Check that nobody wrote ``target`` since `identity` gave ``before``.
 
     Raises:
         OutputError: another process did.
     """
-    if identity(target) not in (None, before):
+    if not _is_same(target, before):
         raise OutputError(
             f"{target}: was written by another process meanwhile; it is left as it is, choose "
             "another name"
@@ -129,8 +134,8 @@ def atomic_folder(target: Path, before: Identity) -> Iterator[Path]:
     what stood there when it was found out that it may be replaced.
 
     Raises:
-        OutputError: the disk refuses, or another process wrote ``target`` meanwhile; nothing is
-            left behind.
+        OutputError: the disk refuses, and nothing is left behind; or another process wrote
+            ``target`` meanwhile, and the new folder stands beside it under a name of its own.
     """
     final = target.absolute()
     part = old = None
@@ -139,7 +144,7 @@ def atomic_folder(target: Path, before: Identity) -> Iterator[Path]:
         old = part.with_suffix(".old")
         part.mkdir(parents=True)
         yield part
-        check_same(final, before)
+        _keep_beside(part, final, before)
         if before is not None and final.exists():  # else the rename refuses to replace it
             final.rename(old)
         try:
@@ -147,7 +152,7 @@ def atomic_folder(target: Path, before: Identity) -> Iterator[Path]:
         except OSError:
             with suppress(FileNotFoundError):
                 old.rename(final)
-            check_same(final, before)
+            _keep_beside(part, final, before)
             raise
     except OSError as error:
         raise OutputError(f"{target}: cannot be written: {error.strerror}") from error
@@ -155,6 +160,25 @@ def atomic_folder(target: Path, before: Identity) -> Iterator[Path]:
         if part is not None:
             shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _keep_beside(part: Path, final: Path, before: Identity) -> None:
+    """Put a finished folder under a free name if somebody wrote ``final`` since ``before``.
+
+    It may be the work of hours, and a file manager that leaves a file there is enough.
+
+    Raises:
+        OutputError: it was so.
+    """
+    if _is_same(final, before):
+        return
+    names = (f"{final.name}-new{number}" for number in ("", *(f"-{n}" for n in range(2, 10_000))))
+    kept = next(path for name in names if not os.path.lexists(path := final.with_name(name)))
+    part.rename(kept)
+    raise OutputError(
+        f"{final}: was written by another process meanwhile; it is left as it is, and what was "
+        f"made now is {kept.name} beside it"
+    )
 
 
 def write_into(
@@ -174,26 +198,42 @@ def write_into(
 def files_in(folder: Path, names: Sequence[str], *, force: bool = False) -> Iterator[Path]:
     """A temporary folder for files of these ``names``; when the block ends they are renamed.
 
-    They go into ``folder``, which is made if missing.
+    They go into ``folder``, which is made if missing: all, or none. What they replace is moved
+    aside first, as for a folder of `atomic_folder`.
 
     Raises:
-        OutputError: one exists there and ``force`` is not given, or the disk refuses; what was
-            there before is then as it was.
+        OutputError: one exists there and ``force`` is not given, or is a folder, or the disk
+            refuses; what was there before is then as it was.
     """
+    olds = {name: unfinished(folder / name).with_suffix(".old") for name in names}
     taken = [name for name in names if os.path.lexists(folder / name)]
     if taken and not force:
         raise OutputError(f"{folder / taken[0]}: already exists; give --force to replace it")
-    is_new, done = not folder.exists(), False
+    for path in (folder / name for name in taken):
+        if path.is_dir() and not path.is_symlink():
+            raise OutputError(f"{path}: is a folder, so it is not replaced; move it away")
+    is_new, done, put = not folder.exists(), False, list[str]()
     part = unfinished(folder / names[0])
     try:
         part.mkdir(parents=True)
         yield part
+        for name in taken:
+            (folder / name).rename(olds[name])
         for name in names:
-            (part / name).replace(folder / name)
+            (part / name).rename(folder / name)
+            put.append(name)
         done = True
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
     finally:
+        for name, old in olds.items():
+            if done:
+                _remove(old)
+            elif os.path.lexists(old):
+                with suppress(OSError):
+                    old.replace(folder / name)
+            elif name in put:
+                _remove(folder / name)
         shutil.rmtree(part, ignore_errors=True)
         if is_new and not done:
             with suppress(OSError):

@@ -2,9 +2,11 @@
 
 import json
 from pathlib import Path
+from typing import Literal
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
+from graphslam.core.output_folder import Identity
 from graphslam.results.file_formats import to_json
 from graphslam.results.report_comparison import Comparison, render_comparison
 from graphslam.results.target_folder import check_target, write_folder
@@ -20,14 +22,22 @@ def is_comparison(directory: Path) -> bool:
 
 
 def save_comparison(
-    comparison: Comparison, config: Config, directory: Path, *, force: bool
+    comparison: Comparison,
+    config: Config,
+    directory: Path,
+    *,
+    force: bool,
+    before: Identity | Literal["now"] = "now",
 ) -> None:
     """Write compare.json, config.toml and report.html atomically.
+
+    ``before``: what `check_target` found when the work began, which alone may be replaced.
 
     Raises:
         OutputError: the target exists and may not be replaced, or the disk refuses.
     """
-    before = check_target(directory, force=force, replaceable=is_comparison)
+    if before == "now":
+        before = check_target(directory, force=force, replaceable=is_comparison)
     settings = dump_config(config)
     files = [
         ("compare.json", to_json(comparison.summary, "compare.json")),

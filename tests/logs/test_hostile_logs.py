@@ -161,7 +161,7 @@ def test_two_writers_of_one_folder_the_second_is_refused_and_what_the_dead_left_
         (part / "mine").touch()
         target.mkdir()
         (target / "theirs").touch()
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".out.7.x", "out"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".out.7.x", "out", "out-new"]
     assert [p.name for p in target.iterdir()] == ["theirs"]
     # a process that died between moving the old folder away and putting the new one there
     target.rename(tmp_path / f".out.{dead}.old")
