@@ -11,6 +11,7 @@ from graphslam.change_detection.detect import ChangeResult
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.objects import Change
 from graphslam.core.geometry import Array
+from graphslam.core.thinning import evenly_thinned
 from graphslam.logs.writer import LogWriter
 from graphslam.results.grid_map import FREE, OCCUPIED, UNKNOWN, write_grid_map
 from graphslam.results.viewer_messages import (
@@ -58,8 +59,7 @@ def write_mcap(found: ChangeResult, path: Path) -> None:
     begin = int(found.later.stamps_ns.min())
     with LogWriter(path) as log:
         for name, visit in (("reference", found.reference), ("later", found.later)):
-            points = visit.ends_of(visit.surface)
-            points = points[:: max(1, len(points) // _MAX_POINTS)]
+            points = evenly_thinned(visit.ends_of(visit.surface), _MAX_POINTS)
             log.message(f"/{name}", CLOUD, point_cloud(points, begin, _FRAME), begin)
         for stamp in sorted({change.first_seen_ns for change in found.changes}):
             markers = [

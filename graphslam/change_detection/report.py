@@ -10,6 +10,7 @@ from graphslam.change_detection.shapes import Displacement
 from graphslam.change_detection.visit import Bools, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import Array, area_centroid, inverse, transform
+from graphslam.core.thinning import evenly_thinned
 from graphslam.results.report_changes import ChangeMark, ChangesPicture, changes_page, tile
 
 #: the picture of the observed area: least size of its squares, m; most squares of a side; most
@@ -75,8 +76,8 @@ def _observed(visit: Visit, limits: Array, square_m: float) -> Bools:
     """Which squares (columns, rows) of ``limits`` beams of a visit crossed or ended in."""
     shape = np.ceil((limits[:, 1] - limits[:, 0]) / square_m).astype(int)
     observed = np.zeros(shape, dtype=bool)
-    every = max(1, len(visit.poses) // _MAX_SCANS)
-    used = np.isfinite(visit.range_m) & (visit.scan % every == 0)
+    scans = evenly_thinned(np.arange(len(visit.poses)), _MAX_SCANS)
+    used = np.isfinite(visit.range_m) & np.isin(visit.scan, scans)
     origin, d = visit.poses[visit.scan[used], :2], visit.directions[used]
     end = visit.range_m[used]
     reach = min(float(end.max()), float(np.hypot(*(limits[:, 1] - limits[:, 0]))))

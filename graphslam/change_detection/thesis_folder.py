@@ -16,6 +16,7 @@ from graphslam.change_detection.visit import Bools
 from graphslam.core.config import ChangesConfig
 from graphslam.core.geometry import Array, unit_vectors
 from graphslam.core.output_folder import Identity, atomic_folder
+from graphslam.core.thinning import evenly_thinned
 from graphslam.results import report_html as html
 from graphslam.results.drawing_elements import INK, PALETTE, Shade, Style, opacity_levels
 from graphslam.results.file_formats import to_json
@@ -258,13 +259,7 @@ def _decision(found: ThesisChanges, limits: Array) -> str:
         axes = map_axes(drawing, limits)
         quiet = found.expected.compared & ~marked
         axes.image(density(ends[quiet], limits, _LATER, _PIXELS), limits)
-        shown = _some(marked)
-        axes.symbols(ends[shown], _CHANGED, 3.0)
+        # more symbols cannot be told apart
+        axes.symbols(evenly_thinned(ends[marked], 3000), _CHANGED, 3.0)
 
     return svg("Decision of the thesis' method", _height(limits), draw)
-
-
-def _some(which: Bools, most: int = 3000) -> NDArray[np.int64]:
-    """Indices of those that are True, evenly thinned: more cannot be told apart."""
-    rows = np.flatnonzero(which)
-    return rows[:: max(1, len(rows) // most)]

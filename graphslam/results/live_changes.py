@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphslam.core.geometry import Array, area_centroid
+from graphslam.core.thinning import evenly_thinned
 from graphslam.results.drawing_elements import PALETTE
 from graphslam.results.live_figure import COLORS, LiveFigure, Series, cloud, joined
 
@@ -51,8 +52,8 @@ def live_changes(picture: "ChangesPicture", colors: Mapping[str, str]) -> LiveFi
             )
     names = picture.names
     clouds = [
-        cloud(_thinned(picture.reference), "reference", "soft", "before"),
-        cloud(_thinned(picture.later), "later", COLORS[PALETTE[0]], "after"),
+        cloud(evenly_thinned(picture.reference, _MAX_POINTS), "reference", "soft", "before"),
+        cloud(evenly_thinned(picture.later, _MAX_POINTS), "later", COLORS[PALETTE[0]], "after"),
     ]
     layers = {"reference": True, "later": True, **{one.layer: True for one in series}}
     return LiveFigure(
@@ -72,7 +73,3 @@ def _named(visit: str, name: str) -> str:
 
 def _closed(polygon: Array) -> Array:
     return np.concatenate([polygon, polygon[:1]])
-
-
-def _thinned(points: Array) -> Array:
-    return points[:: max(1, -(-len(points) // _MAX_POINTS))]

@@ -5,6 +5,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.records import Result, Trajectory
+from graphslam.core.thinning import rows_to_the_last
 from graphslam.results import report_maps as maps
 from graphslam.results.drawing_elements import ACCENT, INK, robot_color
 from graphslam.results.live_figure import (
@@ -111,8 +112,8 @@ def _path(path: Trajectory, clock: _Clock) -> dict[str, Array]:
 
 
 def _thinned(path: Trajectory, most: int) -> Trajectory:
-    """About ``most`` poses at even intervals, with the last one."""
-    chosen = np.unique(np.append(np.arange(0, len(path), max(1, len(path) // most)), len(path) - 1))
+    """At most ``most`` poses at even intervals, with the last one."""
+    chosen = rows_to_the_last(len(path), most)
     return Trajectory(path.stamps_ns[chosen], path.poses[chosen], path.covs[chosen])
 
 

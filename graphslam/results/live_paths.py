@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphslam.core.geometry import Array
+from graphslam.core.thinning import evenly_thinned, rows_to_the_last
 from graphslam.results.drawing_elements import INK, Style
 from graphslam.results.live_figure import LiveFigure, Series, tip_text
 from graphslam.results.report_html import MINUTES_FROM_S
@@ -69,7 +70,7 @@ def live_paths(
                     )
                 )  # fmt: skip
     for xy in comparison.truth.values():
-        kept = xy[:: max(1, len(xy) // _MAX_POSES)]
+        kept = evenly_thinned(xy, _MAX_POSES)
         truth = {"x": kept[:, 0], "y": kept[:, 1]}
         series.append(Series("path", _TRUTH, INK, truth, 1.0, 0.9, "dashed"))
     return LiveFigure(
@@ -83,9 +84,8 @@ def live_paths(
 
 
 def _columns(path: "TimedPath", start_ns: int, most: int) -> dict[str, Array]:
-    """About ``most`` poses at even intervals, with the last one."""
-    last = len(path.stamps_ns) - 1
-    chosen = np.unique(np.append(np.arange(0, last + 1, max(1, (last + 1) // most)), last))
+    """At most ``most`` poses at even intervals, with the last one."""
+    chosen = rows_to_the_last(len(path.stamps_ns), most)
     x, y, heading = path.poses[chosen].T
     time = (path.stamps_ns[chosen] - start_ns) / 1e9
     return {"x": x, "y": y, "heading": heading, "time": time}

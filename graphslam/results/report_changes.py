@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.core.geometry import Array, area_centroid
+from graphslam.core.thinning import evenly_thinned
 from graphslam.results import report_html as html
 from graphslam.results.drawing import Axes
 from graphslam.results.drawing_elements import INK, OPAQUE, PALETTE, Levels, Shade, Style
@@ -186,8 +187,7 @@ def _close_up(picture: ChangesPicture, index: int) -> str:
         ):
             shown = ((cloud > limits[:, 0]) & (cloud < limits[:, 1])).all(axis=1)
             # more points cannot be told apart and enlarge the page
-            chosen = cloud[shown]
-            chosen = chosen[:: max(1, len(chosen) // 2500)]
+            chosen = evenly_thinned(cloud[shown], 2500)
             axes.dots(chosen[:, 0], chosen[:, 1], color, size, 0.55)
         _outlines(axes, mark)
 

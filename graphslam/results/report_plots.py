@@ -10,6 +10,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Result, Trajectory
+from graphslam.core.thinning import evenly_thinned
 from graphslam.results.drawing_elements import ACCENT, INK, Style, robot_color
 from graphslam.results.drawing_scales import linear_scale
 from graphslam.results.report_figure import (
@@ -92,7 +93,7 @@ def innovations(found: Mapping[str, Array], unit: tuple[float, str] = (1e9, "tim
         span = linear_scale(float(times.min()), float(times.max()), 0.01)
         for axes, (model, values) in zip(rows, found.items(), strict=True):
             axes.set_x(span.low, span.high)
-            dots = values[:: max(1, len(values) // _MAX_DOTS)]
+            dots = evenly_thinned(values, _MAX_DOTS)
             axes.dots(dots[:, 0], positive(dots[:, 1], 1e-3), robot_color(0), 1.25, 0.55)
             axes.line(*_running(values, np.mean), Style(INK))
             axes.level(1.0, Style(ACCENT, 1.0))
@@ -111,11 +112,11 @@ def innovations(found: Mapping[str, Array], unit: tuple[float, str] = (1e9, "tim
 def timing(step_ms: Array) -> str:
     """Wall time ``step_ms`` (n,), ms, of every step with its running median."""
     steps = np.arange(len(step_ms))
-    dots = slice(None, None, max(1, len(step_ms) // _MAX_DOTS))
+    dots = evenly_thinned(steps, _MAX_DOTS)
 
     def draw(drawing: Drawing) -> None:
         (axes,) = time_rows(drawing, 1, "step")
-        axes.dots(steps[dots], positive(step_ms[dots], 1e-3), robot_color(0), 1.5, 0.6)
+        axes.dots(dots, positive(step_ms[dots], 1e-3), robot_color(0), 1.5, 0.6)
         axes.line(*_running(np.column_stack([steps, step_ms]), np.median), Style(INK))
         log_scale(axes, "ms")
 
