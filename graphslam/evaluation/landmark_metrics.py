@@ -1,6 +1,5 @@
 """Errors of a landmark map against true landmarks."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -86,20 +85,34 @@ def _undo_exchanges(
     """Matches with exchanged names undone, and the pairs of those names."""
     match = dict(pairs)
     named = [i for i, j in pairs if estimated[i].identity and estimated[i].kind == "point"]
+    if not named:
+        return list(pairs), []
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (imports for long)
+
+    places = np.array([true[match[i]].pose[:2] for i in named])
+    positions = np.array([estimated[i].position[:2] for i in named])
+    reach = np.hypot(*(positions - places).T) / EXCHANGE_RATIO
+    # the few true places that a name may have been exchanged with; 1e-9: `off` decides at the edge
+    near = cKDTree(places).query_ball_point(positions, reach * (1 + 1e-9))
+    owner = list(range(len(named)))  # of each true place; by number in `named`, as `place`
+    place = list(owner)
+
+    def off(point: int, to: int) -> float:
+        return float(np.hypot(*(positions[point] - places[to])))
+
     exchanged = []
-    for a, b in itertools.combinations(named, 2):
-        if all(
-            _point_distance(estimated[i], true[match[i]])
-            > EXCHANGE_RATIO * _point_distance(estimated[i], true[match[k]])
-            for i, k in ((a, b), (b, a))
-        ):
-            match[a], match[b] = match[b], match[a]
-            exchanged.append((str(estimated[a].identity), str(estimated[b].identity)))
+    for a in range(len(named)):
+        for b in sorted(owner[k] for k in near[a] if owner[k] > a):
+            if all(
+                off(i, place[i]) > EXCHANGE_RATIO * off(i, place[k]) for i, k in ((a, b), (b, a))
+            ):
+                place[a], place[b] = place[b], place[a]
+                owner[place[a]], owner[place[b]] = a, b
+                exchanged.append(
+                    (str(estimated[named[a]].identity), str(estimated[named[b]].identity))
+                )
+    match |= {i: match[named[place[k]]] for k, i in enumerate(named)}
     return [(i, match[i]) for i, _ in pairs], exchanged
-
-
-def _point_distance(estimated: Landmark, true: TrueLandmark) -> float:
-    return float(np.hypot(*(estimated.position[:2] - true.pose[:2])))
 
 
 def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[tuple[int, int]]:

@@ -1,6 +1,7 @@
 """Evaluation: every number against a case whose answer is known without it."""
 
 import math
+import time
 
 import numpy as np
 import pytest
@@ -216,6 +217,24 @@ def test_landmarks_that_bear_each_others_names_are_told_and_compared_by_place():
     found = metrics(a=4.1, b=4.1, c=8.1)
     assert found["exchanged"] == []
     assert found["rmse_m"] > 1
+
+
+def test_exchanged_names_among_thousands_are_found_without_looking_at_every_pair():
+    """Breaks when all pairs are compared one by one: 17 s instead of 0.4 s."""
+    rng = np.random.default_rng(4)
+    places = np.column_stack([rng.uniform(0, 300, (3000, 2)), np.full(3000, np.nan)])
+    bears = np.arange(3000)
+    bears[:100] = bears[:100].reshape(50, 2)[:, ::-1].ravel()
+    true = [TrueLandmark("", 0, 0, str(k), "point", at, None) for k, at in enumerate(places)]
+    cov = 0.01 * np.eye(2)
+    found = [
+        landmark(k, "point", places[bears[k]], cov, identity=str(k)) for k in range(len(places))
+    ]
+    began = time.process_time()
+    metrics = landmark_metrics(found, true)
+    assert time.process_time() - began < 5
+    assert metrics["exchanged"] == [(str(k), str(k + 1)) for k in range(0, 100, 2)]
+    assert metrics["rmse_m"] == 0
 
 
 def test_points_without_identity_match_optimally_within_one_metre():
