@@ -210,13 +210,13 @@ def _suspects(aligned: AlignedVisits) -> Bools:
     moved = [np.abs(e.scores(1.0)) > _SUSPECT_SIGMAS for e in aligned.evidence]
     on_old = aligned.evidence[0]
     suspect[on_old.beams[moved[0][on_old.rows]]] = True
-    beams, rows = beams_on_surface(aligned.surfaces[1], aligned.later)
+    beams, rows = beams_on_surface(aligned.surfaces[1])
     suspect[beams[moved[1][rows]]] = True
     return suspect
 
 
-def beams_on_surface(surface: Surface, visit: Visit) -> tuple[Ints, Ints]:
-    """Beams (k,) that end near good pieces of the visit's own surfaces, and those pieces (k,)."""
+def beams_on_surface(surface: Surface) -> tuple[Ints, Ints]:
+    """Beams (k,) that end near good pieces of their visit's own surfaces, and those pieces (k,)."""
     beams = np.nonzero(surface.beams >= 0)[0]
     cell = surface.cells[surface.beams[beams]]
     near = surface.nearest.distance_m[cell] < 2.5 * surface.nearest.grid.cell_m

@@ -163,7 +163,7 @@ def _classify_beams(
     """
     compared = np.zeros(len(later.range_m), dtype=bool)
     marked = compared.copy()
-    behind_old, own = (evidence[0].beams, evidence[0].rows), beams_on_surface(surface, later)
+    behind_old, own = (evidence[0].beams, evidence[0].rows), beams_on_surface(surface)
     for (beams, rows), e in zip((behind_old, own), evidence, strict=True):
         compared[beams[e.tested[rows]]] = True
         marked[beams[flag_pieces(e, sigma, config.false_alarm_rate / 2)[rows]]] = True

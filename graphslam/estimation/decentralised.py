@@ -244,7 +244,7 @@ class DecentralisedBackend(GraphBackend):
             try:
                 start = robot.isam.calculateBestEstimate()
                 values = optimise(robot.graph, start, self._config.robust)
-                robot.isam = isam2_tree(self._config, "QR", robot.graph, values)
+                robot.isam = isam2_tree(self._config, robot.graph, values)
             except RuntimeError as error:
                 raise self.builder.explain(error) from error
             for key, dim in robot.dims.items():

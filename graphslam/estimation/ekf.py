@@ -26,7 +26,6 @@ from graphslam.core.geometry import (
     exp,
     exp_jacobian,
     rotation3,
-    wrap,
 )
 from graphslam.core.observation_models import MODELS, ObservationModel
 from graphslam.core.records import Association, Motion, Start, Step
@@ -40,6 +39,7 @@ from graphslam.estimation.filter_base import (
 )
 from graphslam.estimation.input_checks import check_positive, describe, indeterminate
 from graphslam.estimation.m_estimators import robust_weight
+from graphslam.perception.point_to_line import step_poses
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,9 @@ class PoseError:
     jacobian: Callable[[Array, Array], Array]
 
 
-def _add(pose: Array, error: Array) -> Array:
-    moved = pose + error
-    moved[..., 2] = wrap(moved[..., 2])
-    return moved
-
-
 #: name -> definition: `world` adds errors as the thesis does, `body` is that of GTSAM's Pose2
 ERRORS: dict[str, PoseError] = {
-    "world": PoseError(_add, lambda _pose, _error: np.eye(3)),
+    "world": PoseError(step_poses, lambda _pose, _error: np.eye(3)),
     "body": PoseError(
         lambda pose, error: compose(pose, exp(error)),
         lambda pose, error: rotation3(pose[2]) @ exp_jacobian(error),

@@ -164,14 +164,14 @@ def isam2_parameters(config: Config, factorization: str) -> gtsam.ISAM2Params:
 
 
 def isam2_tree(
-    config: Config, factorization: str, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    config: Config, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
 ) -> gtsam.ISAM2:
-    """A tree of the whole graph, linearised at ``values``.
+    """A tree of the whole graph by QR, linearised at ``values``.
 
     Raises:
         RuntimeError: it is indeterminate.
     """
-    tree = gtsam.ISAM2(isam2_parameters(config, factorization))
+    tree = gtsam.ISAM2(isam2_parameters(config, "QR"))
     tree.update(graph, values)
     return tree
 
@@ -233,7 +233,7 @@ class Isam2Backend(GraphBackend):
         self._factorization = "QR"
         graph, values = self._isam.getFactorsUnsafe(), self._isam.getLinearizationPoint()
         try:
-            self._isam = isam2_tree(self._config, "QR", graph, values)
+            self._isam = isam2_tree(self._config, graph, values)
         except RuntimeError as again:
             raise self._builder.explain(again) from again
 

@@ -259,8 +259,8 @@ class _BackendRun:
                 for path in [getattr(robot, kind)]
             }
         return BackendCurves(
-            self.row["spec"], self.row["label"], self.row["final_is_causal"], paths, curves,
-            self.step_ms, self.landmarks, self.path_m,
+            self.row["spec"], self.row["label"], paths, curves, self.step_ms, self.landmarks,
+            self.path_m,
         )  # fmt: skip
 
 

@@ -21,7 +21,6 @@ from graphslam.core.geometry import (
     wrap,
 )
 from graphslam.core.motion_models import (
-    HELD_SIGMA,
     MOTION_SOURCES,
     RATES,
     Calibration,
@@ -109,11 +108,6 @@ class Track(Readings):
     @property
     def _mount_slice(self) -> slice:
         return slice(self.increment_parameters, self.increment_parameters + 3)
-
-    @property
-    def is_mount_estimated(self) -> BoolArray:
-        """(3,) which of x, y and yaw of the mount are not held."""
-        return np.asarray(np.diag(self.mount_cov) > HELD_SIGMA**2)
 
     def add_mount_cov(self, cov: Array) -> None:
         """Add (3, 3) to the covariance of the mount."""

@@ -61,7 +61,6 @@ class BackendCurves:
 
     spec: str
     label: str
-    final_is_causal: bool
     paths: Mapping[str, Mapping[str, TimedPath]]
     curves: Mapping[str, Mapping[str, ErrorCurve]]
     step_ms: Array

@@ -81,9 +81,7 @@ def two_back_ends():
             paths[kind] = {"robot": TimedPath(stamps, poses)}
             error = ErrorCurve(stamps, np.abs(poses[:, 1]), np.zeros(101), np.ones(101))
             curves[kind] = {"robot": error}
-        backends.append(
-            BackendCurves(name, name, name == "EKF", paths, curves, *3 * [np.ones(101)])
-        )
+        backends.append(BackendCurves(name, name, paths, curves, *3 * [np.ones(101)]))
     summary = {
         "mode": "replay", "recorded_by": "batch", "reference": "batch", "rows": rows,
         "start_given": True, "logs": [{"path": "run.mcap", "sha256": "ab" * 32}], "warnings": [],

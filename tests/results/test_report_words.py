@@ -94,7 +94,7 @@ def of_a_comparison():
     }  # fmt: skip
     path, three = {"robot": TimedPath(np.arange(3), np.eye(3))}, np.ones(3)
     curves = BackendCurves(
-        "ekf", "EKF", True, {"final": path, "causal": path}, {"final": {}, "causal": {}},
+        "ekf", "EKF", {"final": path, "causal": path}, {"final": {}, "causal": {}},
         three, three, three,
     )  # fmt: skip
     return render_comparison(Comparison(summary, (curves,), {}))
