@@ -6,6 +6,7 @@ Run: python docs/configuration.py   (or `make pages`)
 import dataclasses
 import inspect
 import json
+import math
 import re
 import typing
 from collections.abc import Mapping
@@ -122,6 +123,8 @@ def plural(text: str) -> str:
 def default(defaults: Any, name: str) -> str:
     """A default as TOML; a table is empty."""
     value = getattr(defaults, name)
+    if value == math.inf:  # JSON, which writes all else as TOML does, has none
+        return "inf"
     return "{}" if isinstance(value, Mapping) else json.dumps(value)
 
 

@@ -91,6 +91,7 @@ _CLASSES = {
         "Trajectory",
         "WheelAngles",
     ),
+    "evaluation.relation_metrics": ("Relations",),
     "live.follow": ("follow",),
     "live.live_pass": ("LiveEstimate",),
     "live.session": ("Session",),
@@ -98,16 +99,17 @@ _CLASSES = {
     "results.folder": ("SavedResult",),
     "results.map_files": ("MapFiles",),
     "results.report_comparison": ("Comparison",),
-    "simulation": ("ScenarioError", "Simulation"),
+    "simulation": ("Scenario", "ScenarioError", "Simulation"),
 }
 
 __all__ = [
     "Change", "ChangeResult", "Comparison", "Config", "ConfigError", "Estimate", "EstimationError",
     "GraphSlamError", "GroundTruth", "Landmark", "LiveEstimate", "LogError", "LogSet", "LogWriter",
-    "MapFiles", "OdometryIncrement", "OdometryPose", "OutputError", "RelativePose", "Result",
-    "RobotResult", "SavedResult", "Scan", "ScenarioError", "Session", "Sighting", "Simulation",
-    "Trajectory", "WheelAngles", "__version__", "changes_between", "compare", "evaluate", "follow",
-    "load_config", "load_result", "make_map", "open_logs", "simulate", "smooth", "write_viewer",
+    "MapFiles", "OdometryIncrement", "OdometryPose", "OutputError", "Relations", "RelativePose",
+    "Result", "RobotResult", "SavedResult", "Scan", "Scenario", "ScenarioError", "Session",
+    "Sighting", "Simulation", "Trajectory", "WheelAngles", "__version__", "changes_between",
+    "compare", "evaluate", "follow", "load_config", "load_result", "make_map", "open_logs",
+    "simulate", "smooth", "write_viewer",
 ]  # fmt: skip
 
 if not TYPE_CHECKING:  # a type checker would take every name for defined

@@ -8,6 +8,7 @@ import re
 import pytest
 from paths import ROOT
 
+import graphslam
 from graphslam.cli.commands import app
 from graphslam.core.config import Config, RobotConfig
 from graphslam.core.config_io import RENAMED_KEYS
@@ -32,6 +33,18 @@ def test_the_readme_has_every_command_and_only_links_that_lead_somewhere():
     assert targets
     for target in targets:
         assert target.startswith("https://") or (ROOT / target).exists(), target
+
+
+def test_every_public_name_is_in_the_reference():
+    page = (ROOT / "docs/api.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"^\.\. auto\w+:: graphslam\.(\w+)$", page, flags=re.M))
+    assert named == set(graphslam.__all__) - {"__version__"}
+
+
+def test_the_readme_names_every_public_function():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    names = [name for name in graphslam.__all__ if name[0].islower()]
+    assert [name for name in names if f"`{name}`" not in readme] == []
 
 
 def thesis_rows():

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -65,6 +66,20 @@ def test_a_type_checker_sees_the_classes_that_are_imported_lazily():
     assert lazy <= seen
     assert {name for _, name in lazy} <= set(graphslam.__all__)
     assert (ROOT / "graphslam/py.typed").is_file()
+
+
+def test_every_type_that_a_public_function_names_is_public():
+    """Who annotates a program of their own finds it without looking into the package."""
+    tree = ast.parse(Path(graphslam.__file__).read_text(encoding="utf-8"))
+    named = {
+        word
+        for function in tree.body
+        if isinstance(function, ast.FunctionDef) and function.name in graphslam.__all__
+        for argument in [*function.args.args, *function.args.kwonlyargs]
+        for word in re.findall(r"[A-Z]\w+", ast.unparse(argument.annotation))
+    }
+    private = {"Any", "Callable", "None", "PathLike", "Recording", "Sequence", "Truth"}
+    assert named - private <= set(graphslam.__all__)
 
 
 def modules_after(code):

@@ -49,7 +49,7 @@ class LimitsConfig:
     """What a log may ask for; more is an error of one line, because a damaged log can ask for all.
 
     memory_mb: of one process. chunk_mb, chunk_records: of a chunk (a block of messages that a file
-    holds compressed) when unpacked. robots, landmarks: in one run.
+    holds compressed) when unpacked. `robots`, landmarks: in one run.
     """
 
     memory_mb: float = math.inf
