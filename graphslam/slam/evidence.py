@@ -17,6 +17,7 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, RobotResult, Step
 from graphslam.odometry.interpolation import IntArray
 from graphslam.odometry.missing_increments import MissingIncrements
+from graphslam.slam.curved_walls import curved_share
 from graphslam.slam.log_pass import LogPass
 from graphslam.slam.path_evidence import NO_PATH, PathMisfits
 from graphslam.slam.robot_state import RobotState
@@ -80,7 +81,8 @@ class RobotEvidence:
     ``parked``: when it stood, by odometry; ``along_walls``: how its scans fit if its path was
     another one there; ``bridged_sigma_m``: of its position where scans were all that told;
     ``missing``: what increments of its odometry leave out;
-    ``lost_ns`` (l, 2): times of consecutive scans that have nothing in common, see `ComparedScans`.
+    ``lost_ns`` (l, 2): times of consecutive scans that have nothing in common, see `ComparedScans`;
+    ``curved``: share of what it saw of walls, see `curved_share`.
     """
 
     name: str
@@ -101,6 +103,7 @@ class RobotEvidence:
     bridged_sigma_m: float = 0.0
     missing: MissingIncrements = field(default_factory=MissingIncrements)
     lost_ns: IntTable = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    curved: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +137,8 @@ def gather(
     by_scans = pipeline.scan_evidence or gather_scan_evidence(pipeline, estimate)
     for name, run in pipeline.started.items():
         motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
-        seen = [a for s in steps for a in s.associations if a.robot == name and len(a.z) == 2]
+        own = [a for step in steps for a in step.associations if a.robot == name]
+        seen = [a for a in own if len(a.z) == 2]
         result = robots[name]
         some = np.unique(np.linspace(0, len(result.final) - 1, MOST_POSES).astype(int))
         found.append(
@@ -157,6 +161,7 @@ def gather(
                 along_walls=by_scans[name].along_walls,
                 bridged_sigma_m=run.track.bridged_sigma_m,
                 lost_ns=np.array(run.lost, dtype=np.int64).reshape(-1, 2),
+                curved=curved_share(own),
             )
         )
     observed = any(step.associations or step.closures for step in steps)

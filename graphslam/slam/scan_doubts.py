@@ -16,6 +16,8 @@ HOP_M, HOP_RAD = 1.2, 1.0
 HOPS = 0.3
 #: share of motions in which scans contradict odometry, and how many of so many in a row
 CONTRADICTED, IN_A_ROW, ROW = 0.12, 8, 12
+#: share of what was seen of walls that is of curves: of Intel and ACES up to 0.04
+CURVED = 0.15
 #: ns without a scan in which a robot may be carried
 UNSEEN_NS = 2_000_000_000
 
@@ -28,6 +30,7 @@ def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
             yield from _sparse(robot)
             yield from _contradictions(robot, evidence)
             yield from _moved_unseen(robot, evidence)
+            yield from _curved(robot)
 
 
 def _repeated(robot: RobotEvidence) -> Iterator[Reason]:
@@ -95,6 +98,17 @@ def _moved_unseen(robot: RobotEvidence, evidence: Evidence) -> Iterator[Reason]:
             f"{robot.name}: its scans before and after a pause of {seconds(end, begin)}, "
             f"{seconds(begin, int(robot.scans_ns[0]))} after the first one, are not as its "
             "odometry says, which hardly moved: it was moved meanwhile, and where to is a guess"
+        )
+        yield Reason("doubtful", "scans", robot.name, text)
+
+
+def _curved(robot: RobotEvidence) -> Iterator[Reason]:
+    if robot.curved > CURVED:
+        text = (
+            f"{robot.name}: {100 * robot.curved:.0f} % of what it saw of walls is of curved ones; "
+            "they are mapped as straight pieces, which move along with the robot: its path may be "
+            "too short, or turned, by far more than is stated; front_end.name=none goes by "
+            "odometry instead"
         )
         yield Reason("doubtful", "scans", robot.name, text)
 

@@ -172,6 +172,10 @@ def moved_point(own):
 
 #: what is wrong, and what is said about it
 WRONG = {
+    "curved walls": (
+        lambda: evidence(scans=True, seen=no_sightings, curved=0.3),
+        "30 % of what it saw of walls is of curved ones",
+    ),
     "a named point that is moved": (
         lambda: evidence(seen=moved_point),
         "the point p3: its sightings until 27.5 s agree on one place",
