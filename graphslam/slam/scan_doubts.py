@@ -18,8 +18,11 @@ HOPS = 0.3
 CONTRADICTED, IN_A_ROW, ROW = 0.12, 8, 12
 #: share of what was seen of walls that is of curves: of Intel and ACES up to 0.04
 CURVED = 0.15
-#: ns without a scan in which a robot may be carried
-UNSEEN_NS = 2_000_000_000
+#: ns without a scan, and usual times between two, in which a robot may be carried
+UNSEEN_NS, UNSEEN_SCANS = 1_000_000_000, 3
+#: ns without a scan in which a robot may stop and start again; m and rad that one which drives
+#: comes in the second before and after; and the share of that speed at which it stands
+STOP_NS, SECOND_NS, DRIVES, STOOD = 5_000_000_000, 1_000_000_000, 0.1, 0.1
 
 
 def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
@@ -30,6 +33,7 @@ def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
             yield from _sparse(robot)
             yield from _contradictions(robot, evidence)
             yield from _moved_unseen(robot, evidence)
+            yield from _stood_unseen(robot, evidence)
             yield from _curved(robot)
 
 
@@ -88,7 +92,8 @@ def _moved_unseen(robot: RobotEvidence, evidence: Evidence) -> Iterator[Reason]:
     motions = np.column_stack([robot.motions_ns[which], robot.motions_ns[which + 1]])
     spans = np.concatenate([robot.lost_ns, motions[_is_elsewhere(robot, motions)]])
     pauses = np.array([_pause(robot, *span) for span in spans.tolist()]).reshape(-1, 2)
-    pauses = pauses[pauses[:, 1] - pauses[:, 0] >= UNSEEN_NS]
+    least = max(UNSEEN_NS, UNSEEN_SCANS * float(np.median(np.diff(robot.scans_ns))))
+    pauses = pauses[pauses[:, 1] - pauses[:, 0] >= least]
     at = np.minimum(np.searchsorted(robot.readings_ns, pauses), len(robot.readings_ns) - 1)
     moved = np.abs(between(robot.readings[at[:, 0]], robot.readings[at[:, 1]]))
     pauses = pauses[(np.hypot(moved[:, 0], moved[:, 1]) < HOP_M) & (moved[:, 2] < HOP_RAD)]
@@ -98,6 +103,32 @@ def _moved_unseen(robot: RobotEvidence, evidence: Evidence) -> Iterator[Reason]:
             f"{robot.name}: its scans before and after a pause of {seconds(end, begin)}, "
             f"{seconds(begin, int(robot.scans_ns[0]))} after the first one, are not as its "
             "odometry says, which hardly moved: it was moved meanwhile, and where to is a guess"
+        )
+        yield Reason("doubtful", "scans", robot.name, text)
+
+
+def _stood_unseen(robot: RobotEvidence, evidence: Evidence) -> Iterator[Reason]:
+    """Pauses of the laser in which odometry stands, though it drove before and after them.
+
+    It has not counted then, as where a recording was interrupted: no scan contradicts that along
+    walls, where all places look the same.
+    """
+    if robot.name in evidence.without_odometry:
+        return
+    long = np.flatnonzero(np.diff(robot.scans_ns) >= STOP_NS)
+    begin, end = robot.scans_ns[long], robot.scans_ns[long + 1]
+    times = np.column_stack([begin - SECOND_NS, begin, end, end + SECOND_NS])
+    at = np.minimum(np.searchsorted(robot.readings_ns, times), len(robot.readings_ns) - 1)
+    moved = np.abs(between(robot.readings[at[:, :-1]], robot.readings[at[:, 1:]]))
+    # m, or rad where it turns: both are of the order of what a robot does in a second
+    far = np.hypot(moved[:, :, 0], moved[:, :, 1]) + moved[:, :, 2]
+    drove = np.minimum(far[:, 0], far[:, 2])
+    stood = far[:, 1] < STOOD * drove * (end - begin) / SECOND_NS
+    for k in np.flatnonzero((drove > DRIVES) & stood)[:1].tolist():
+        text = (
+            f"{robot.name}: odometry stands for {seconds(end[k], int(begin[k]))} without a scan, "
+            f"{seconds(begin[k], int(robot.scans_ns[0]))} after the first one, though it drove "
+            "just before and after that: it may have moved meanwhile, and where to is a guess"
         )
         yield Reason("doubtful", "scans", robot.name, text)
 

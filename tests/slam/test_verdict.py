@@ -172,6 +172,10 @@ def moved_point(own):
 
 #: what is wrong, and what is said about it
 WRONG = {
+    "a recording that was interrupted while the robot drove": (
+        lambda: interrupted(counted=False),
+        "odometry stands for 8.",
+    ),
     "curved walls": (
         lambda: evidence(scans=True, seen=no_sightings, curved=0.3),
         "30 % of what it saw of walls is of curved ones",
@@ -352,6 +356,29 @@ def test_a_laser_that_pauses_while_its_robot_stands_is_no_doubt():
     # nor are scans that have nothing in common without a pause
     lost = np.array([[196 * S, 199 * S]]) // 10
     assert reasons(evidence(scans=True, seen=no_sightings, lost_ns=lost)) == ("good", "")
+
+
+def interrupted(*, counted):
+    """Nothing is recorded from 20 to 28 s, while the robot drives on."""
+    steps = drive()
+    found = evidence(scans=True, seen=no_sightings)
+    (robot,) = found.robots
+    inside = slice(191, 270)
+    if not counted:
+        steps[inside] = 0.0
+    poses = path(steps)
+    kept = np.ones(N, dtype=bool)
+    kept[inside] = False
+    times = robot.scans_ns
+    made = replace(
+        robot, scans_ns=times[(times <= 20 * S) | (times >= 28 * S)], final=poses,
+        by_odometry=poses, readings=poses[kept], readings_ns=robot.readings_ns[kept],
+    )  # fmt: skip
+    return replace(found, robots=(made,))
+
+
+def test_odometry_that_counts_in_a_pause_of_the_laser_is_no_doubt_there():
+    assert "odometry stands" not in reasons(interrupted(counted=True))[1]
 
 
 def sparse(found):
