@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import (
     Array,
     adjoint,
@@ -19,6 +20,7 @@ from graphslam.core.geometry import (
     rotate_cov,
     rotation3,
     transform,
+    wrap,
 )
 from graphslam.core.motion_models import Calibration
 from graphslam.core.mount_covariances import MountCovariances
@@ -28,6 +30,11 @@ from graphslam.odometry.preintegration import Track
 
 IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
+#: squared distance, three degrees of freedom, and m, rad, beyond which a motion that odometry did
+#: not see is no noise. Where it is less, Intel's scans between states are better placed by noise
+SLIP, SLIP_M, SLIP_RAD = float(chi2_quantile(0.9999, 3)), 0.2, 0.2
+#: m², rad²: least variances of noise
+TINY = 1e-10 * np.eye(3)
 #: ns: a robot's velocity is its motion from so long before to so long after
 HALF_SPAN_NS = 250_000_000
 
@@ -88,7 +95,10 @@ def causal_at(
 class _Interval:
     """Times (n,) between two states, and the odometry: from the first to them, and all of it.
 
-    ``inside``: whether there is a second state. ``share`` of the motion that is driven; 0 if not.
+    ``inside``: whether there is a second state. ``share`` of the motion that is driven, of the time
+    where a ``slip`` is most of it; 0 if there is none.
+    ``slip`` (n, 3): what the motion between the states is beyond that of the odometry, where that
+    is no noise; else 0.
     """
 
     before: IntArray
@@ -99,6 +109,7 @@ class _Interval:
     noise: Array
     whole: Array
     whole_noise: Array
+    slip: Array
 
     @classmethod
     def of(cls, states: Trajectory, track: Track, times_ns: IntArray) -> "_Interval":
@@ -110,18 +121,33 @@ class _Interval:
         begin, first, of = np.unique(i, return_index=True, return_inverse=True)
         end = at[following[first]]
         whole, whole_noise = track.coarse_motions(at[begin], end, known, same[: len(begin)])
-        whole, whole_noise = whole[of], whole_noise[of]
+        off = between(states.poses[begin], states.poses[following[first]]) - whole
+        off[:, 2] = wrap(off[:, 2])
+        slips = (np.hypot(off[:, 0], off[:, 1]) > SLIP_M) | (np.abs(off[:, 2]) > SLIP_RAD)
+        slips &= mahalanobis_squared(off, whole_noise + TINY) > SLIP
+        off[~slips] = 0.0
+        whole, whole_noise, off = whole[of], whole_noise[of], off[of]
         inside = following > i
         effort = track.effort(at)
         driven = np.where(inside, effort[following] - effort[i], 0.0)
         share = (track.effort(times_ns) - effort[i]) / np.where(driven > 0, driven, 1.0)
-        share = np.clip(np.where(driven > 0, share, 0.0), 0.0, 1.0)
-        return cls(i, following, inside, share, delta, noise, whole, whole_noise)
+        # most of the motion was not seen, and may have been while odometry stood
+        unseen = np.hypot(off[:, 0], off[:, 1]) + np.abs(off[:, 2]) > driven
+        passed = (times_ns - at[i]) / np.maximum(at[following] - at[i], 1)
+        share = np.where(unseen & off.any(axis=1), passed, np.where(driven > 0, share, 0.0))
+        share = np.clip(share, 0.0, 1.0)
+        return cls(i, following, inside, share, delta, noise, whole, whole_noise, off)
 
     def noise_between(self) -> Array:
-        """Covariances (n, 3, 3) given the states, along the axes of the one before."""
+        """Covariances (n, 3, 3) given the states, along the axes of the one before.
+
+        Noise adds up bit by bit, and given both ends s (1 - s) of it is left. What a robot slips
+        comes at once: it is in front of a pose, or behind it, with the chances s and 1 - s, which
+        leaves the same share of its square.
+        """
         s = self.share[:, None, None]
-        return np.where(self.inside[:, None, None], s * (1 - s) * self.whole_noise, self.noise)
+        whole = self.whole_noise + self.slip[:, :, None] * self.slip[:, None, :]
+        return np.where(self.inside[:, None, None], s * (1 - s) * whole, self.noise)
 
 
 def final_at(

@@ -222,6 +222,25 @@ def test_no_correction_happens_while_the_robot_stands():
     np.testing.assert_allclose(found[3], [1.0, 0.1, 0.0], atol=1e-12)
 
 
+def test_where_a_robot_slipped_between_states_is_not_known():
+    """By odometry it drove 2 m, by the states 1 m: the metre was lost anywhere between them. As
+    noise, which adds up bit by bit, half way 1 cm would be left of it."""
+    track = odometry_track([0, 1, 2], [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    ends = Trajectory(ns([0, 2]), np.array([[0, 0, 0], [1.0, 0, 0]]), np.zeros((2, 3, 3)))
+    found = at([0, 1, 1.5, 2], causal=False, given=ends, track=track)
+    np.testing.assert_allclose(found.poses[:, 0], [0, 0.5, 0.75, 1], atol=1e-12)
+    sigma = np.sqrt(found.covs[:, 0, 0])
+    np.testing.assert_allclose(sigma, [0, 0.5, np.sqrt(3 / 16), 0], atol=5e-3)  # and that noise
+
+
+def test_a_motion_that_odometry_did_not_see_at_all_may_have_been_at_any_time():
+    """Frozen odometry: by its own shares the robot would stand where it froze, and then jump."""
+    track = odometry_track([0, 8, 10], [[0, 0, 0], [0, 0, 0], [0.1, 0, 0]])
+    ends = Trajectory(ns([0, 10]), np.array([[0, 0, 0], [2, 0, 0]]), np.zeros((2, 3, 3)))
+    found = at([2, 4, 8], causal=False, given=ends, track=track).poses
+    np.testing.assert_allclose(found[:, 0], [0.38, 0.76, 1.52], atol=1e-12)
+
+
 def test_turning_on_the_spot_takes_its_share_of_the_correction():
     """Odometry errors grow with turning, too; by path alone this interval would have none."""
     track = odometry_track([0, 1, 2], [[0, 0, 0], [0, 0, 1.0], [0, 0, 2.0]])
