@@ -330,7 +330,10 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         for a, b in known.identities.items()
         if a < b
     ]
-    warnings += noise_warnings(pipeline.noise)
+    # of a robot without odometry nothing is stated: its motions are those of its scans
+    scans_alone = {f"{name} motion" for name in pipeline.log.without_odometry}
+    stated = {k: v for k, v in pipeline.noise.items() if k not in scans_alone}
+    warnings += noise_warnings(stated)
     if not pipeline.config.logs.same_place:  # sessions are of different times
         warnings += span_warnings(
             {name: run.track for name, run in pipeline.runs.items()},

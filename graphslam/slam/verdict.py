@@ -177,7 +177,10 @@ def _unplaced(evidence: Evidence) -> Iterable[Reason]:
         left_out = dropped.get(f"{kind}: no odometry near it", 0)
         if left_out > UNPLACED * (left_out + used):
             part = f"{left_out} of {left_out + used} {kind}s"
-            text = f"{part} were left out: no odometry is near them"
+            text = (
+                f"{part} were left out: no odometry is near them; two clocks, or it is missing? "
+                "See graphslam info"
+            )
             yield Reason("doubtful", "unplaced", "", text)
 
 
