@@ -9,14 +9,15 @@ A folder or archive with, per robot:
 - ``laser.csv``: x m, y m, heading rad of the laser on the base; without it the base itself.
 - ``truth.csv`` or ``truth.tum``: true poses, as odometry.
 
-Files of several robots are called ``NAME.odometry.csv``. Columns are separated by commas or blanks;
-lines that begin with ``#`` and a first line of names are left out.
+Files of several robots are called ``NAME.odometry.csv``. Columns of a file are separated by
+semicolons, and then decimal commas may be used, else by commas, else by blanks; lines of poses have
+as many columns as each other. Lines that begin with ``#`` and a first line of names are left out.
 """
 
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -32,7 +33,8 @@ from graphslam.logs.source_files import text_files
 from graphslam.logs.writer import Event, LogWriter
 
 _FILES = re.compile(r"(?:(?P<robot>.+)\.)?(?P<what>odometry|scans|laser|truth)\.(?P<kind>csv|tum)")
-_SEPARATOR = re.compile(r"[,;\s]\s*")
+#: characters with which a number begins
+_NUMERIC = frozenset("0123456789+-.")
 
 Pose = tuple[float, float, float]
 _T = TypeVar("_T")
@@ -58,20 +60,21 @@ def import_csv(source: Path, target: Path) -> ImportSummary:
         found = _FILES.fullmatch(name)
         assert found is not None  # `text_files` gives no others
         robot = found["robot"] or DEFAULT_ROBOT
-        malformed: Counter[str] = Counter()
         if found["what"] == "laser":
-            mounts[robot] = next(_parsed(text, _numbers, malformed), (0.0, 0.0, 0.0))
+            own_mounts, unreadable = _parsed(text, _numbers, same_width=True)
+            mounts[robot] = own_mounts[0] if own_mounts else (0.0, 0.0, 0.0)
         else:
             parse = _event(found["what"], found["kind"], robot)
-            own = list(_parsed(text, parse, malformed))
+            own, unreadable = _parsed(text, parse, same_width=found["what"] != "scans")
             if not own:
                 raise LogError(
-                    f"{source}: {name} has no usable line; stamps are seconds, all numbers decimal"
+                    f"{source}: {name} has no usable line; stamps are seconds, all numbers "
+                    "decimal, with commas only if ; is between the columns, and lines of poses "
+                    "have as many columns as their names"
                 )
             events += own
-        warnings += [
-            f"{source}: {n} lines of {name} cannot be read" for n in malformed.values() if n
-        ]
+        if unreadable:
+            warnings.append(f"{source}: {unreadable} lines of {name} cannot be read")
     events.sort(key=lambda event: event.stamp_ns)
     with LogWriter(target, {"format": "csv", "source": source.name}) as log:
         for robot, mount in mounts.items():
@@ -81,16 +84,56 @@ def import_csv(source: Path, target: Path) -> ImportSummary:
     return ImportSummary(source, target, log.counts, tuple(warnings))
 
 
-def _parsed(text: str, parse: Callable[[list[str]], _T], malformed: Counter[str]) -> Iterator[_T]:
-    """What ``parse`` makes of each line; a first line of names is no malformed one."""
-    for number, line in enumerate(text.splitlines()):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        fields = _SEPARATOR.split(line.strip())
+def _parsed(
+    text: str, parse: Callable[[list[str]], _T], *, same_width: bool
+) -> tuple[list[_T], int]:
+    """What ``parse`` makes of each line, and how many lines it cannot read.
+
+    A first line of names is none of these. With ``same_width`` lines that have not as many columns
+    as the names, or as most, cannot be read: a comma in them may be a decimal one.
+    """
+    lines = [line.strip() for line in text.removeprefix("\ufeff").splitlines()]
+    lines = [line for line in lines if line and not line.startswith("#")]
+    separator = _separator(lines)
+    width = _width(lines, separator) if same_width else None
+    made, unreadable = [], 0
+    for number, line in enumerate(lines):
+        fields = _fields(line, separator)
         try:
-            yield parse(fields)
+            if width not in (None, len(fields)):
+                raise ValueError("another number of columns")
+            made.append(parse(fields))
         except (ValueError, IndexError):
-            malformed["lines"] += number > 0
+            unreadable += number > 0 or _is_numeric(line)
+    return made, unreadable
+
+
+def _separator(lines: Sequence[str]) -> str | None:
+    """What is between the columns of most lines of numbers; None: blanks."""
+    numeric = [line for line in lines if _is_numeric(line)]
+    for separator in (";", ","):
+        if 2 * sum(separator in line for line in numeric) > len(numeric):
+            return separator
+    return None
+
+
+def _fields(line: str, separator: str | None) -> list[str]:
+    """The columns of a line; next to semicolons a comma is that of a decimal number."""
+    if separator == ";":
+        line = line.replace(",", ".")
+    return [field.strip() for field in line.split(separator)]
+
+
+def _width(lines: Sequence[str], separator: str | None) -> int:
+    """How many columns the lines have: as many as names, where these are separated like numbers."""
+    if lines and not _is_numeric(lines[0]) and separator is not None and separator in lines[0]:
+        return len(_fields(lines[0], separator))
+    widths = Counter(len(_fields(line, separator)) for line in lines if _is_numeric(line))
+    return widths.most_common(1)[0][0] if widths else 0
+
+
+def _is_numeric(line: str) -> bool:
+    return line[0] in _NUMERIC
 
 
 def _event(what: str, kind: str, robot: str) -> Callable[[list[str]], Event]:

@@ -80,3 +80,52 @@ def test_lines_that_cannot_be_read_are_counted_and_a_file_of_them_is_refused(log
     path.write_text("1700000000123456789,0,0,0\n1700000000223456789,0,0,0\n")
     with pytest.raises(LogError, match="stamps are seconds"):
         IMPORTERS["csv"](source, tmp_path / "log.mcap")
+
+
+def poses_of(folder, name, text):
+    """What the odometry of a log is that was imported from such a table."""
+    source = folder / name
+    source.mkdir()
+    (source / "odometry.csv").write_text(text)
+    target = folder / f"{name}.mcap"
+    assert IMPORTERS["csv"](source, target).warnings == ()
+    return [(m.stamp_ns, *m.pose) for m in open_logs([target], Config()).messages()]
+
+
+POSES = np.column_stack(
+    [np.arange(9) / 10, np.arange(9) / 100, -np.arange(9) / 50, np.full(9, 0.25)]
+)
+
+
+@pytest.mark.parametrize("names", ["", "# a log\n\nstamp{0}x{0}y{0}phi\n", "\ufeff"])
+@pytest.mark.parametrize(
+    ("separator", "decimal"),
+    [(";", ","), (" ; ", ","), *((s, ".") for s in (";", ",", " , ", ", ", "  ", "\t"))],
+)
+def test_columns_are_separated_by_one_thing_in_a_file(names, separator, decimal, tmp_path):
+    """With semicolons numbers may have decimal commas, as spreadsheets of many countries write."""
+    lines = [separator.join(f"{v:.3f}".replace(".", decimal) for v in row) for row in POSES]
+    found = poses_of(tmp_path, "log", names.format(separator) + "\n".join(lines))
+    assert [f[0] for f in found] == [100_000_000 * k for k in range(9)]
+    np.testing.assert_allclose([f[1:] for f in found], POSES[:, 1:], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "stamp,x,y,phi\n" + "0,1,0,01,0,0,0,0\n" * 5,  # decimal commas between commas
+        "0,1 0,01 0,0 0,0\n" * 5,  # and between blanks
+    ],
+)
+def test_decimal_commas_that_cannot_be_told_are_refused(text, tmp_path):
+    (tmp_path / "odometry.csv").write_text(text)
+    with pytest.raises(LogError, match=r"odometry.csv has no usable line.*commas only if ;"):
+        IMPORTERS["csv"](tmp_path, tmp_path / "log.mcap")
+
+
+def test_a_line_of_poses_with_another_number_of_columns_is_counted(tmp_path):
+    lines = [",".join(map(str, row)) for row in POSES]
+    lines[3] += ",0,0"
+    (tmp_path / "odometry.csv").write_text("\n".join(lines))
+    (warning,) = IMPORTERS["csv"](tmp_path, tmp_path / "log.mcap").warnings
+    assert "1 lines of odometry.csv cannot be read" in warning
