@@ -62,7 +62,12 @@ def import_csv(source: Path, target: Path) -> ImportSummary:
         robot = found["robot"] or DEFAULT_ROBOT
         if found["what"] == "laser":
             own_mounts, unreadable = _parsed(text, _numbers, same_width=True)
-            mounts[robot] = own_mounts[0] if own_mounts else (0.0, 0.0, 0.0)
+            if not own_mounts:
+                raise LogError(
+                    f"{source}: {name} has no usable line; it is x m, y m, heading rad of the "
+                    "laser on the base; without the file the laser is at the base itself"
+                )
+            mounts[robot] = own_mounts[0]
         else:
             parse = _event(found["what"], found["kind"], robot)
             own, unreadable = _parsed(text, parse, same_width=found["what"] != "scans")

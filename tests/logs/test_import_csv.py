@@ -129,3 +129,11 @@ def test_a_line_of_poses_with_another_number_of_columns_is_counted(tmp_path):
     (tmp_path / "odometry.csv").write_text("\n".join(lines))
     (warning,) = IMPORTERS["csv"](tmp_path, tmp_path / "log.mcap").warnings
     assert "1 lines of odometry.csv cannot be read" in warning
+
+
+@pytest.mark.parametrize("text", ["x=0.3,y=0.1,phi=0\n", "0.3 0.1\n", "x,y\n0.3,0.1\n", ""])
+def test_a_mount_that_cannot_be_read_is_not_that_of_a_laser_at_the_base(text, log, tmp_path):
+    source = tables(log, tmp_path / "tables", "csv")
+    (source / "laser.csv").write_text(text)
+    with pytest.raises(LogError, match=r"laser.csv has no usable line.*x m, y m, heading rad"):
+        IMPORTERS["csv"](source, tmp_path / "log.mcap")
