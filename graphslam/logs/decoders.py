@@ -22,6 +22,7 @@ from graphslam.logs.mounts import Mount, levelled
 from graphslam.logs.point_cloud import beam_step, cloud_points, is_planar, sweep_of
 from graphslam.logs.record_checks import (
     UnusableMessageError,
+    check_beams,
     check_finite,
     check_pose,
     check_sighting,
@@ -102,11 +103,10 @@ def scans(rows: Any, topic: TopicContext) -> list[records.Scan | str]:
     found: list[records.Scan | str] = []
     for i, stamp in enumerate(schemas.stamps_ns(rows).tolist()):
         start, step, period = starts[i], steps[i], periods[i]
-        if not beams:
-            found.append("scan: no beams")
-            continue
-        if not (math.isfinite(start) and math.isfinite(step) and step):
-            found.append("scan: angle increment is zero or angles are not finite")
+        try:
+            check_beams(beams, start, step)
+        except UnusableMessageError as reason:
+            found.append(str(reason))
             continue
         own = _NO_RANGES
         if not topic.without_ranges:

@@ -88,6 +88,14 @@ def check_wheels(left_rad: float, right_rad: float) -> None:
         raise UnusableMessageError("joints: angle is beyond what a wheel turns")
 
 
+def check_beams(number: int, angle_min_rad: float, angle_step_rad: float) -> None:
+    """Raises `UnusableMessageError` where a scan has no beams, or they have no directions."""
+    if not number:
+        raise UnusableMessageError("scan: no beams")
+    if not (math.isfinite(angle_min_rad) and math.isfinite(angle_step_rad) and angle_step_rad):
+        raise UnusableMessageError("scan: angle increment is zero or angles are not finite")
+
+
 def check_sighting(z: Array) -> None:
     """Raises `UnusableMessageError` where no bearing rad, range m and direction rad are like z."""
     if not all(map(math.isfinite, z.tolist())):
@@ -157,7 +165,7 @@ def _relative_pose(message: records.RelativePose) -> None:
 
 
 def _scan(message: records.Scan) -> None:
-    check_finite("scan", np.array([message.angle_min_rad, message.angle_step_rad]))
+    check_beams(len(message.ranges), message.angle_min_rad, message.angle_step_rad)
 
 
 #: the numbers of records; where the same letter stands, the same number of elements

@@ -225,6 +225,19 @@ def test_a_message_that_cannot_be_used_is_left_out_and_counted(changes, reason):
     np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in left])
 
 
+def test_scans_that_smooth_drops_are_left_out_and_counted(room):
+    """No estimates come of those without directions or beams, and the others are as without."""
+    few = room[1][:300]
+    scans = [k for k, m in enumerate(few) if isinstance(m, Scan)]
+    bad = {scans[3]: {"angle_step_rad": 0.0}, scans[7]: {"ranges": np.empty(0)}}
+    left = list(graphslam.Session().process(m for k, m in enumerate(few) if k not in bad))
+    session = graphslam.Session()
+    found = list(session.process(replace(m, **bad.get(k, {})) for k, m in enumerate(few)))
+    reasons = "angle increment is zero or angles are not finite", "no beams"
+    assert session.dropped == {f"scan: {reason}": 1 for reason in reasons}
+    np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in left])
+
+
 def test_lists_are_arrays_and_what_is_no_message_is_counted():
     """A program that has its numbers as lists gets the same estimates; None is no end of all."""
     messages = list(sightings())

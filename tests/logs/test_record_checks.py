@@ -24,7 +24,10 @@ def test_a_record_that_is_right_is_the_same_one():
         (changed(SCAN, mount=None), r"Scan: mount must be an array \(3\) of numbers"),
         (changed(SCAN, bearings=np.ones(2)), r"Scan: bearings must be an array \(n\) of numbers"),
         (changed(SCAN, angle_min_rad="left"), "Scan: angle_min_rad must be a number"),
-        (changed(SCAN, angle_step_rad=np.nan), "scan: not finite"),
+        (changed(SCAN, angle_step_rad=np.nan), "scan: angle increment is zero or angles are not"),
+        (changed(SCAN, angle_min_rad=np.inf), "scan: angle increment is zero or angles are not"),
+        (changed(SCAN, angle_step_rad=0.0), "scan: angle increment is zero or angles are not"),
+        (changed(SCAN, ranges=np.empty(0)), "scan: no beams"),
         (WheelAngles("robot", 1, 1, None, 0.0), "WheelAngles: left_rad must be a number"),
     ],
 )
