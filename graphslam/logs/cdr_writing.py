@@ -22,8 +22,11 @@ def scan_bytes(
     step_rad: float,
     ranges: NDArray[np.float32],
     limits_m: tuple[float, float] = (0.0, 0.0),
+    times_s: tuple[float, float] = (0.0, 0.0),
 ) -> bytes:
     """sensor_msgs/LaserScan of ranges (n,) m; limits of 0 are none.
+
+    ``times_s``: between two beams, and between two scans; 0: not known.
 
     Raises:
         LogError: the stamp does not fit.
@@ -33,7 +36,7 @@ def scan_bytes(
     _add_text(data, frame)
     _align(data, 4)
     end = start_rad + step_rad * max(len(ranges) - 1, 0)
-    data += struct.pack("<7f", start_rad, end, step_rad, 0.0, 0.0, *limits_m)
+    data += struct.pack("<7f", start_rad, end, step_rad, *times_s, *limits_m)
     data += struct.pack("<I", len(ranges)) + ranges.astype("<f4").tobytes()
     return bytes(data + struct.pack("<I", 0))
 

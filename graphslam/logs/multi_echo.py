@@ -48,4 +48,5 @@ def first_echoes(data: bytes) -> bytes:
         message.angle_increment,
         np.array(ranges, dtype=np.float32),
         (message.range_min, message.range_max),
+        (message.time_increment, message.scan_time),
     )

@@ -223,6 +223,21 @@ def test_other_schemas_give_the_same_trajectory(name, room, expected, tmp_path):
     np.testing.assert_array_equal(trajectory.poses, expected.poses)
 
 
+def test_first_echoes_are_as_long_after_each_other_as_all_echoes(tmp_path):
+    """By these times a sweep is corrected for the motion of the robot."""
+    beams = [schemas.build("sensor_msgs/msg/LaserEcho", echoes=np.float32([2, 3]))] * 5
+    scan = schemas.build(
+        MULTI_ECHO, header=schemas.header(START_NS, "laser"), angle_min=-1.0, angle_max=1.0,
+        angle_increment=0.5, time_increment=0.001, scan_time=0.025, range_min=0.1,
+        range_max=30.0, ranges=beams, intensities=[],
+    )  # fmt: skip
+    with LogWriter(tmp_path / "log.mcap") as out:
+        out.odometry("robot", START_NS, np.zeros(3))
+        out.message("/scan", MULTI_ECHO, scan, START_NS)
+    *_, found = open_logs([tmp_path / "log.mcap"], Config()).messages()
+    assert found.beam_period_s == pytest.approx(0.001)
+
+
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
 @pytest.mark.parametrize("name", foxglove.KINDS)
 @given(data=st.binary(max_size=60))
@@ -256,11 +271,13 @@ def test_a_scan_that_is_turned_in_its_frame_has_turned_beams_and_one_that_is_mov
 @pytest.mark.parametrize("frame", ["", "a", "laser", "robot1/laser_frame"])
 def test_what_is_written_is_what_the_reference_reads(frame):
     """Alignment depends on the lengths of names."""
-    data = scan_bytes(5_000_000_007, frame, -1.0, 0.5, np.float32([1, np.inf, 3]), (0.1, 9.0))
+    ranges, limits, times = np.float32([1, np.inf, 3]), (0.1, 9.0), (0.25, 0.5)
+    data = scan_bytes(5_000_000_007, frame, -1.0, 0.5, ranges, limits, times)
     store = schemas._typestore()
     scan = store.deserialize_cdr(data, schemas.LASER_SCAN)
     assert scan.header.frame_id == frame and scan.header.stamp.nanosec == 7
     assert scan.ranges.tolist() == [1, np.inf, 3] and scan.range_max == 9.0
+    assert (scan.time_increment, scan.scan_time) == times
     transforms = [(k, frame, f"child{'x' * k}", tuple(range(7))) for k in range(5)]
     message = store.deserialize_cdr(tf_bytes(transforms), schemas.TF_MESSAGE)
     names = [(t.header.frame_id, t.child_frame_id) for t in message.transforms]
