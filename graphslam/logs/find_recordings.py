@@ -1,6 +1,5 @@
 """Recordings in folders: each file or rosbag2 folder that can be read as a log of its own."""
 
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,9 +22,10 @@ class FoundRecordings:
 def find_recordings(places: Sequence[Path], without: Path | None = None) -> FoundRecordings:
     """Every recording in files and folders, by name; folders are searched through.
 
-    A folder with a metadata.yaml is one recording, and so is every file elsewhere whose content or
-    name is that of one: a damaged file is to be heard of. The name is the path below its folder,
-    without suffix and separators. ``without``: a folder that is not searched.
+    Links are followed, into each folder once. A folder with a metadata.yaml is one recording, and
+    so is every file elsewhere whose content or name is that of one: a damaged file is to be heard
+    of. The name is the path below its folder, without suffix and separators. ``without``: a folder
+    that is not searched.
 
     Raises:
         LogError: a place does not exist or cannot be searched, or there is no recording.
@@ -35,7 +35,7 @@ def find_recordings(places: Sequence[Path], without: Path | None = None) -> Foun
     skipped = without.resolve() if without is not None else None
     for place in places:
         base = place if place.is_dir() and not _is_rosbag2(place) else place.parent
-        for path, is_log in _search(place, skipped):
+        for path, is_log in _search(place, {skipped} if skipped else set()):
             if is_log:
                 found.setdefault(path.resolve(), path.relative_to(base))
             else:
@@ -69,23 +69,26 @@ def _without_suffix(path: Path) -> Path:
     return path.with_suffix("") if path.suffix in RECORDING_SUFFIXES else path
 
 
-def _search(place: Path, skipped: Path | None) -> Iterator[tuple[Path, bool]]:
-    """Files and rosbag2 folders of a place, and whether each is a recording."""
+def _search(place: Path, visited: set[Path]) -> Iterator[tuple[Path, bool]]:
+    """Files and rosbag2 folders of a place, and whether each is a recording.
+
+    ``visited`` are folders, resolved, that are not searched (again): links may lead in circles.
+    """
     if not place.exists():
         raise LogError(f"{place}: no such file or folder; check the path")
     if not place.is_dir() or _is_rosbag2(place):
         yield place, True
         return
+    visited.add(place.resolve())
     try:
-        entries = sorted(os.scandir(place), key=lambda entry: entry.name)
-        for entry in entries:
-            path = Path(entry.path)
-            if entry.name.startswith("."):
+        for path in sorted(place.iterdir(), key=lambda path: path.name):
+            if path.name.startswith("."):
                 continue
-            if entry.is_dir():
-                if path.resolve() != skipped:
-                    yield from _search(path, skipped)
-            elif entry.is_file():
+            # of a link to itself both are false, where those of `os.DirEntry` raise
+            if path.is_dir():
+                if path.resolve() not in visited:
+                    yield from _search(path, visited)
+            elif path.is_file():
                 yield path, path.suffix in RECORDING_SUFFIXES or is_recording(path)
     except OSError as error:
         raise LogError(f"{place}: cannot be searched: {error.strerror}") from error

@@ -237,6 +237,23 @@ def test_recordings_are_found_by_content_and_named_apart(tmp_path):
         find_recordings([tmp_path / "gone"])
 
 
+def test_links_in_circles_do_not_stop_a_search(tmp_path):
+    """Each folder is searched once, those elsewhere too."""
+    runs, elsewhere = tmp_path / "runs", tmp_path / "elsewhere"
+    for path in (runs / "x/day.mcap", elsewhere / "night.mcap"):
+        path.parent.mkdir(parents=True)
+        path.write_bytes(b"\x89MCAP0\r\n")
+    (runs / "notes.md").write_text("x")
+    for link, target in (
+        ("x/up", runs), ("x/here", runs / "x"), ("itself", runs / "itself"), ("gone", runs / "no"),
+        ("more", elsewhere), ("again", elsewhere), ("above", tmp_path),
+    ):  # fmt: skip
+        (runs / link).symlink_to(target)
+    found = find_recordings([runs])
+    assert [path.name for _, path in found.recordings] == ["night.mcap", "day.mcap"]
+    assert [path.name for path in found.others] == ["notes.md"]
+
+
 # ------------------------------------------------------------ comparisons
 
 
