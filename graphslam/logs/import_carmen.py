@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.core.errors import LogError
-from graphslam.core.geometry import between
+from graphslam.core.geometry import between, wrap
 from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.physical_limits import MAX_RANGE_M
@@ -171,6 +171,8 @@ def _mount(laser: int, ahead_m: float | None, scans: Sequence[_Scan]) -> _Pose:
     if poses:
         robot, own = np.array(poses).transpose(1, 0, 2)
         relative = between(robot, own)
+        # headings from the first one: those of a laser that looks back are on both sides of pi
+        relative[:, 2] = relative[0, 2] + wrap(relative[:, 2] - relative[0, 2])
         middle = np.median(relative, axis=0)
         # poses of the laser that were corrected by a SLAM program do not stay on the robot
         if (np.abs(between(middle, relative)) <= _MOUNT_SPREAD).all():

@@ -389,6 +389,20 @@ def test_a_laser_that_is_logged_under_two_names_is_taken_once(tmp_path):
     )
 
 
+def test_the_mount_of_a_laser_that_looks_back_is_on_both_sides_of_pi(tmp_path):
+    """Headings of its lines are rounded, and the half turn is now positive, now negative."""
+    source = tmp_path / "log.clf"
+    back, lines = np.array([-0.3, 0.0, np.pi]), []
+    for k, (stamp, pose, ranges) in enumerate(_carmen_drive()):
+        laser = geometry.compose(pose, back) + np.array([0.0, 0.0, 1e-6 * (-1) ** k])
+        numbers = [len(ranges), *ranges.tolist(), *laser.tolist(), *pose.tolist()]
+        lines.append(f"RLASER {_text(*numbers)} {_END.format(stamp=stamp)}")
+    source.write_text("\n".join(lines))
+    messages = run("carmen", source, tmp_path / "log.mcap")
+    for scan in (m for m in messages if isinstance(m, records.Scan)):
+        np.testing.assert_allclose(geometry.between(back, scan.mount), 0.0, atol=2e-6)
+
+
 def test_poses_of_the_laser_that_were_corrected_are_no_mount(tmp_path):
     """In corrected logs the first pose of FLASER is that of a SLAM program, not the odometry's."""
     source = tmp_path / "log.clf"
