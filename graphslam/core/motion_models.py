@@ -64,11 +64,18 @@ def model_error_cov(twists: Array, seconds: Array, config: OdometryConfig) -> Ar
     return cov
 
 
-def unit_error_covs(twists: Array, seconds: Array) -> Array:
-    """Covariances ``(n, 9, 3, 3)`` of `model_error_cov` by a rate of one each, as in `RATES`."""
+def unit_error_covs(source: str, rows: Array, calibration: Array, robot: RobotConfig) -> Array:
+    """Covariances ``(n, 9, 3, 3)`` of `model_error_cov` by a rate of one each, as in `RATES`.
+
+    Of a source that does not state its noise, by its ``rows`` (n, k) and ``calibration`` (p,), see
+    `MOTION_SOURCES`. Not by its increments: their headings are wrapped, and where the robot turns
+    by more than half a turn between two readings they do not tell how far it turned and drove.
+    """
+    is_wheels = source == "wheels"
+    twists = wheel_twist(rows, _calibrated(robot, calibration)) if is_wheels else rows[:, :3]
     covs = np.zeros((len(twists), 3, 3, 3, 3))  # motion, axis, unit, covariance
     for axis in range(3):
-        covs[:, axis, :, axis, axis] = _amounts(twists, seconds)
+        covs[:, axis, :, axis, axis] = _amounts(twists, rows[:, -1])
     return covs.reshape(len(twists), len(RATES), 3, 3)
 
 
@@ -202,12 +209,7 @@ def wheel_increments(
     The counting error of one reading enters two neighbouring increments with opposite signs and
     nearly cancels; it is treated as white here (cautious), thesis eq. 4.9.
     """
-    robot = replace(
-        robot,
-        wheel_radius_left_m=robot.wheel_radius_left_m + calibration[0],
-        wheel_radius_right_m=robot.wheel_radius_right_m + calibration[1],
-        axle_m=robot.axle_m + calibration[2],
-    )
+    robot = _calibrated(robot, calibration)
     rows, seconds = rows[:, :2], rows[:, 2]
     twists = wheel_twist(rows, robot)
     J = exp_jacobian(twists) @ wheel_jacobian(rows, robot)
@@ -215,6 +217,16 @@ def wheel_increments(
     counting = (config.count_sigma_rad**2 * moved)[:, None, None]
     cov = model_error_cov(twists, seconds, config) + counting * (J[:, :, 2:4] @ J[:, :, 2:4].mT)
     return Increments(exp(twists), cov, J[:, :, [0, 1, 4]])
+
+
+def _calibrated(robot: RobotConfig, calibration: Array) -> RobotConfig:
+    """A robot with the corrections (3,) of its wheels, see `wheel_increments`."""
+    return replace(
+        robot,
+        wheel_radius_left_m=robot.wheel_radius_left_m + calibration[0],
+        wheel_radius_right_m=robot.wheel_radius_right_m + calibration[1],
+        axle_m=robot.axle_m + calibration[2],
+    )
 
 
 def mounted_motion(delta: Array, mount: Array) -> tuple[Array, Array]:

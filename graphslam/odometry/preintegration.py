@@ -17,7 +17,6 @@ from graphslam.core.geometry import (
     compose,
     inverse,
     inverse_cov,
-    log,
     wrap,
 )
 from graphslam.core.motion_models import (
@@ -436,7 +435,8 @@ def path_sums(
     of = np.concatenate([of_whole, of_time, of_time])
     made = tracks[0].increments(rows, mean[0] if len(tracks) == 1 else mean[of])
     if by_rate:
-        made = replace(made, cov=unit_error_covs(log(made.delta), rows[:, -1]))
+        covs = unit_error_covs(tracks[0].source, rows, mean[0], tracks[0]._robot)
+        made = replace(made, cov=covs)
     first = firsts[of_time]
     index, index_earlier = np.hstack([span.index for span in spans]) + first
     sums = IncrementSums(made.part(0, w), firsts[of_whole])

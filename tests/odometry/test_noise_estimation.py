@@ -27,6 +27,8 @@ def driven(kind, *, mounted):
         step = 0.1 * speed
         pose = pose + np.array([step * np.cos(heading), step * np.sin(heading), 0.1 * turn])
         angles = angles + 0.1 * np.array([speed - 0.2 * turn, speed + 0.2 * turn]) / 0.1
+        if kind == "wheels that jump" and k in (114, 230):  # encoders whose counters overflow
+            angles[k % 4 // 2] -= 65.7
         time_ns = 100 * S + k * S // 10
         track.add(
             OdometryPose("r", time_ns, time_ns, pose)
@@ -37,10 +39,11 @@ def driven(kind, *, mounted):
 
 
 @pytest.mark.parametrize("mounted", [False, True])
-@pytest.mark.parametrize("kind", ["poses", "wheels"])
+@pytest.mark.parametrize("kind", ["poses", "wheels", "wheels that jump"])
 def test_variances_by_rate_are_those_that_motions_gain(kind, mounted):
     """Each rate changed by one changes the variances by its column: they are linear in the rates.
-    A rate at another place, or a lever arm left out, is off by far more than rounding."""
+    A rate at another place, or a lever arm left out, is off by far more than rounding. Where
+    several turns are between two readings, the arcs cannot be told from where they end."""
     track = driven(kind, mounted=mounted)
     times = 100 * S + np.arange(0, 39 * S, 730_000_000)
     between = times[:-1], times[1:]
@@ -51,3 +54,4 @@ def test_variances_by_rate_are_those_that_motions_gain(kind, mounted):
     for k, one in enumerate(np.eye(len(RATES))):
         gained = motion_variances(track, with_rates(bare, one), between) - none
         np.testing.assert_allclose(found[:, :, k], gained, atol=1e-9)  # of 0.7
+    assert found.min() > -1e-9
