@@ -84,7 +84,7 @@ def _search(place: Path, visited: set[Path]) -> Iterator[tuple[Path, bool]]:
         for path in sorted(place.iterdir(), key=lambda path: path.name):
             if path.name.startswith("."):
                 continue
-            # of a link to itself both are false, where those of `os.DirEntry` raise
+            # of a link to itself both are false, where the entries of os.scandir raise
             if path.is_dir():
                 if path.resolve() not in visited:
                     yield from _search(path, visited)
