@@ -25,6 +25,7 @@ from graphslam.logs.growing_mcap import GrowingMcap, open_growing
 from graphslam.logs.log_set import FileReader, damage, decoded, log_set_of
 from graphslam.logs.recording import Recording, deriver
 from graphslam.logs.time_order import DROPPED, TOO_LATE, MessageSorter
+from graphslam.logs.wheel_turns import with_whole_turns
 from graphslam.results.target_folder import check_target
 
 #: s between two versions of the folder, at least; and how many times as long as writing one takes
@@ -149,7 +150,7 @@ def _messages(
     logs = replace(config.logs, reorder_s=config.live.reorder_s)
     reader = FileReader(file, replace(config, logs=logs))
     folder.sorter = reader.sorter
-    yield from reader.sorted(recorded())
+    yield from with_whole_turns(reader.sorted(recorded()), log.wrapped, folder.repaired)
     for counts in reader.sorter.counts.values():
         folder.dropped += Counter({kind: counts.pop(kind, 0) for kind in DROPPED})
         folder.repaired.update(counts)

@@ -31,6 +31,7 @@ def find_gyroscopes(
     topics: Sequence[Topic],
     contexts: Mapping[str, TopicContext],
     config: Config,
+    wrapped: frozenset[str] = frozenset(),
 ) -> tuple[dict[str, Turning], list[Finding]]:
     """The turning of each robot that reports poses or wheel angles and has a gyroscope.
 
@@ -39,6 +40,7 @@ def find_gyroscopes(
         topics: those that are used.
         contexts: of the topics.
         config: settings.
+        wrapped: robots whose wheels' angles begin again after each turn, see `wheel_turns`.
     """
     found: dict[str, Turning] = {}
     findings: list[Finding] = []
@@ -52,12 +54,13 @@ def find_gyroscopes(
         tree = static_tree(files, robot, sampled_edges(files, robot))
         times, rates = turn_rates(files, names[0], tree, base_frame(files, odometry[0]))
         wheels = _wheels(robot, files, config)
-        readings = list(_readings(files, odometry[0], contexts[odometry[0].name]))
+        readings = list(odometry_readings(files, odometry[0], contexts[odometry[0].name]))
         readings.sort(key=itemgetter(0))
         at: IntArray = np.array([time for time, _ in readings], dtype=np.int64)
         poses = np.array([reading for _, reading in readings])
         if odometry[0].record is WheelAngles:
-            poses = _path(poses.reshape(-1, 2), wheels)
+            angles = poses.reshape(-1, 2)
+            poses = _path(np.unwrap(angles, axis=0) if robot in wrapped else angles, wheels)
         turning = find_turning(names[0], times, rates, at, poses.reshape(-1, 3))
         where = f"robot {robot}"
         if isinstance(turning, str):
@@ -98,7 +101,7 @@ def _path(angles: Array, wheels: RobotConfig) -> Array:
     return np.column_stack([xy, heading])
 
 
-def _readings(
+def odometry_readings(
     files: Sequence[Recording], topic: Topic, context: TopicContext
 ) -> Iterator[tuple[int, Array]]:
     """Times, ns, and poses (3,) of the odometry or angles (2,), in the order of recording."""

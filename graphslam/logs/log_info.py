@@ -34,6 +34,7 @@ from graphslam.logs.topics import (
     choose_topics,
     find_topics,
 )
+from graphslam.logs.wheel_turns import find_wrapped_wheels
 
 _GAP_PERIODS, _GAP_S = 10, 1.0  # a gap is longer than both: 10 periods of the topic and 1 s
 _REVERSING_M = 1e-3  # smallest backward step; larger than the noise of a robot at rest
@@ -110,6 +111,12 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         for topic in topics
         if topic.count
     }
+    wrapped, turns = find_wrapped_wheels(files, chosen, contexts)
+    findings += turns
+    for topic in chosen:
+        if topic.record is records.WheelAngles and topic.robot in wrapped:
+            own = readings[topic.name]
+            own.motion = list(np.unwrap(np.array(own.motion), axis=0))
     used = {topic.name for topic in (*chosen, *lasers.topics)}
     infos = [
         _topic_info(files, topic, topic.name in used, readings.get(topic.name), contexts)
@@ -125,7 +132,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
     # how a sensor is mounted that is not used does not matter
     findings += [f for f in assumed if problem or f.topic.partition(": ")[0] in names]
     if not problem:
-        gyroscopes, by_gyroscope = find_gyroscopes(files, chosen, contexts, config)
+        gyroscopes, by_gyroscope = find_gyroscopes(files, chosen, contexts, config, wrapped)
         findings += by_gyroscope
         names = {turning.topic for turning in gyroscopes.values()}
         infos = [replace(info, used=info.used or info.name in names) for info in infos]

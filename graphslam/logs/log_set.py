@@ -26,6 +26,7 @@ from graphslam.logs.sessions import open_recordings
 from graphslam.logs.stated_noise import StatedNoise, stated_noise
 from graphslam.logs.topic_context import topic_contexts
 from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic, choose_topics
+from graphslam.logs.wheel_turns import find_wrapped_wheels, with_whole_turns
 
 Odometry = records.OdometryIncrement | records.OdometryPose | records.WheelAngles
 
@@ -59,6 +60,7 @@ class LogSet:
             ``range:``) by reason; filled when `messages` is exhausted.
         repaired: the same for messages that are used in spite of a defect.
         gyroscopes: robot -> its turning by a gyroscope, which its odometry in `messages` has.
+        wrapped: robots whose wheels' angles begin again after each turn; in `messages` they go on.
         opened: the indexed recordings, in the order of ``files``.
         config: the settings that the logs were opened with.
         further_lasers: topics of lasers besides those in ``topics``, see `graphslam.logs.lasers`.
@@ -76,6 +78,7 @@ class LogSet:
     config: Config = field(repr=False)
     gyroscopes: Mapping[str, Turning] = field(repr=False, default_factory=dict)
     further_lasers: tuple[Topic, ...] = ()
+    wrapped: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
@@ -260,9 +263,10 @@ class LogSet:
         """Messages of ``topics`` and, last, the report about all of them."""
         readers = [FileReader(file, self.config) for file in self.opened]
         streams = [reader.sorted(reader.recorded(topics, contexts)) for reader in readers]
-        merged = time_order.merge(streams)
+        report, merged = ReadReport(), time_order.merge(streams)
+        if self.wrapped:
+            merged = with_whole_turns(merged, self.wrapped, report.repaired)
         yield from with_turning(merged, self.gyroscopes) if self.gyroscopes else merged
-        report = ReadReport()
         for reader in readers:
             report.dropped.update(reader.dropped)
             for topic, counts in sorted(reader.sorter.counts.items()):
@@ -321,14 +325,15 @@ def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
             raise LogError(f"{', '.join(str(file.path) for file in files)}: {finding.line}")
     check_separate_times(files, topics, contexts)
     lasers = further_lasers(files, found, topics, config)
-    gyroscopes, by_gyroscope = find_gyroscopes(files, topics, contexts, config)
-    findings = (*damage(files), *derived, *choices, *lasers.findings, *assumed, *by_gyroscope)
+    wrapped, turns = find_wrapped_wheels(files, topics, contexts)
+    gyroscopes, by_gyroscope = find_gyroscopes(files, topics, contexts, config, wrapped)
+    found_by = (*derived, *choices, *lasers.findings, *assumed, *turns, *by_gyroscope)
     return LogSet(
         robots=tuple(sorted({t.robot for t in topics if t.record in MOTION_KINDS})),
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),
         topics=tuple(topics),
         notes=merged_notes(files),
-        warnings=[*config.warnings, *(said.line for said in findings)],
+        warnings=[*config.warnings, *(said.line for said in (*damage(files), *found_by))],
         dropped=Counter(),
         repaired=Counter(),
         opened=files,
@@ -336,6 +341,7 @@ def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
         config=config,
         gyroscopes=gyroscopes,
         further_lasers=tuple(lasers.topics),
+        wrapped=wrapped,
     )
 
 

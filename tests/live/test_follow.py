@@ -8,6 +8,7 @@ from paths import LOGS
 from room_log import SCAN, S, drive
 
 import graphslam
+from graphslam.core.geometry import wrap
 from graphslam.core.records import OdometryPose, Scan
 from graphslam.live import follow as follow_module
 from graphslam.logs import LogWriter, growing_mcap
@@ -173,6 +174,24 @@ def test_a_recording_of_which_nothing_can_be_used_is_refused(tmp_path):
     with pytest.raises(graphslam.LogError, match="without odometry"):
         graphslam.follow(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_turns_of_wheels_are_counted_from_the_first_messages_on(tmp_path):
+    """Their angles begin again after each turn; taken as they are the robot would go back."""
+    path = tmp_path / "wheels.mcap"
+    with LogWriter(path) as log:
+        log.mount("robot", S, (0, 0, 0))
+        for k in range(100):
+            angle = float(wrap(0.4 * k))
+            log.wheel_angles("robot", S + k * S // 10, angle, angle)
+            log.scan("robot", S + k * S // 10, np.full(101, np.inf), **SCAN)
+    told = graphslam.follow(path, tmp_path / "out", live={"wait_s": 1.0})
+    assert told["repaired"] == {"joints: angle begins again after a turn": 6}
+    (said,) = (line for line in told["warnings"] if "begin again after each turn, 12 times" in line)
+    assert said.startswith("/joint_states: ")
+    x_m = [float(line.split()[1]) for line in
+           (tmp_path / "out/trajectories/robot.causal.tum").read_text().splitlines()]  # fmt: skip
+    assert np.all(np.diff(x_m) > 0)
 
 
 def test_robots_of_unknown_start_are_said(tmp_path):
