@@ -103,8 +103,9 @@ def test_robots_without_names_are_recognised(with_names, tmp_path, backend, say)
 @pytest.mark.parametrize("backend", ["batch", "ekf"])
 def test_what_is_rejected_changes_nothing(tmp_path, backend):
     """A tenth of the sightings of robots are 2 m too far: every trajectory is that of a log without
-    these, the causal ones to rounding, the final ones as far as they have converged. Breaks if one
-    of the ways to an estimate takes in what another one rejects."""
+    these, the causal ones to rounding, the final ones as far as they have converged: the noise that
+    is found may differ by a tenth, which is 0.1 mm here. Breaks if one of the ways to an estimate
+    takes in what another one rejects."""
 
     def spoil(z, rng, observer, seen, seconds):
         return z + np.array([0.0, 2.0 * is_exchanged(observer, seen, seconds)])
@@ -123,7 +124,7 @@ def test_what_is_rejected_changes_nothing(tmp_path, backend):
     assert false.summary["rejected"][NOT_THERE] > 20
     for robot, right in absent.robots.items():
         found = false.robots[robot]
-        for a, b, atol in ((found.causal, right.causal, 1e-7), (found.final, right.final, 1e-4)):
+        for a, b, atol in ((found.causal, right.causal, 1e-7), (found.final, right.final, 2e-4)):
             np.testing.assert_array_equal(a.stamps_ns, b.stamps_ns)
             np.testing.assert_allclose(a.poses, b.poses, atol=atol)
 
