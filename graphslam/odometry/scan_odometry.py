@@ -10,6 +10,7 @@ motion remains that of the odometry.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,14 +87,25 @@ def check_motions(
     some = [motions[k] for k in left], [before[k] for k in left], [now[k] for k in left]
     for k, match in zip(left, match_motions(*some, here[left]), strict=True):
         if match is not None:
-            corrected = _corrected(motions[k], *match, before[0].config)
-            if corrected is motions[k] or is_denied(now[k], before[k], motions[k].delta, match[0]):
-                checked[k] = corrected
+            motion = _corrected(motions[k], match.pose, match.cov, before[0].config)
+            if not match.searched or is_denied(now[k], before[k], motions[k].delta, match.pose):
+                checked[k] = motion
     return checked
 
 
+class ScanMatch(NamedTuple):
+    """Pose (3,) of a scan seen from the one before, and its cov (3, 3).
+
+    ``searched``: it was found in a wide window, not near the motion of the odometry.
+    """
+
+    pose: Array
+    cov: Array
+    searched: bool
+
+
 def is_denied(now: Submap, before: Submap, delta: Array, other: Array) -> bool:
-    """Whether scans deny a motion (3,) where they lie better on each other at an ``other`` (3,).
+    """Whether scans deny a motion (3,) where they lie better on each other at one far off (3,).
 
     They do if each sees through what the other saw, or if nearly all of them is the same at the
     other motion. Where a laser sees a narrow part and turns, much of a scan is out of sight of the
@@ -106,8 +118,8 @@ def is_denied(now: Submap, before: Submap, delta: Array, other: Array) -> bool:
 
 def match_motions(
     motions: Sequence[Motion], before: Sequence[Submap], now: Sequence[Submap], overlap: Array
-) -> list[tuple[Array, Array] | None]:
-    """What scans say of motions: pose (3,) and its cov (3, 3); None where they do not match.
+) -> list[ScanMatch | None]:
+    """What scans say of motions; None where they do not match.
 
     Arguments are those of `check_motions`; ``overlap`` (n,) is the share of points of ``now`` on
     ``before`` at the motion: a match has more.
@@ -118,7 +130,7 @@ def match_motions(
     poses, covs, _ = align_pairs(now, before, [motion.delta for motion in motions])
     shares = shares_on_others(now, before, poses)
     needed = np.maximum(MIN_OVERLAP, overlap + MIN_OVERLAP_GAIN)
-    found = [[(s, p, c)] for s, p, c in zip(shares, poses, covs, strict=True)]
+    found = [[(s, ScanMatch(p, c, False))] for s, p, c in zip(shares, poses, covs, strict=True)]
     lost = np.flatnonzero(shares < needed).tolist()
     window = np.array([config.search_m, config.search_m, config.search_rad])
     matches = match_pairs(
@@ -131,11 +143,13 @@ def match_motions(
     for k, own in zip(lost, matches, strict=True):
         at = np.array([m.pose for m in own]).reshape(-1, 3)
         again = shares_on_others([now[k]] * len(own), [before[k]] * len(own), at)
-        found[k] += [(share, m.pose, m.cov) for share, m in zip(again, own, strict=True)]
+        found[k] += [
+            (share, ScanMatch(m.pose, m.cov, True)) for share, m in zip(again, own, strict=True)
+        ]
     best = [max(candidates, key=lambda one: one[0]) for candidates in found]
     return [
-        (pose, cov) if share >= least else None
-        for (share, pose, cov), least in zip(best, needed, strict=True)
+        match if share >= least else None
+        for (share, match), least in zip(best, needed, strict=True)
     ]
 
 
