@@ -121,22 +121,19 @@ class _Interval:
         begin, first, of = np.unique(i, return_index=True, return_inverse=True)
         end = at[following[first]]
         whole, whole_noise = track.coarse_motions(at[begin], end, known, same[: len(begin)])
-        off = between(states.poses[begin], states.poses[following[first]]) - whole
-        off[:, 2] = wrap(off[:, 2])
-        slips = (np.hypot(off[:, 0], off[:, 1]) > SLIP_M) | (np.abs(off[:, 2]) > SLIP_RAD)
-        slips &= mahalanobis_squared(off, whole_noise + TINY) > SLIP
-        off[~slips] = 0.0
-        whole, whole_noise, off = whole[of], whole_noise[of], off[of]
+        moved = between(states.poses[begin], states.poses[following[first]])
+        slip = _slips(moved, whole, whole_noise)
+        whole, whole_noise, slip = whole[of], whole_noise[of], slip[of]
         inside = following > i
         effort = track.effort(at)
         driven = np.where(inside, effort[following] - effort[i], 0.0)
         share = (track.effort(times_ns) - effort[i]) / np.where(driven > 0, driven, 1.0)
         # most of the motion was not seen, and may have been while odometry stood
-        unseen = np.hypot(off[:, 0], off[:, 1]) + np.abs(off[:, 2]) > driven
+        unseen = np.hypot(slip[:, 0], slip[:, 1]) + np.abs(slip[:, 2]) > driven
         passed = (times_ns - at[i]) / np.maximum(at[following] - at[i], 1)
-        share = np.where(unseen & off.any(axis=1), passed, np.where(driven > 0, share, 0.0))
+        share = np.where(unseen, passed, np.where(driven > 0, share, 0.0))
         share = np.clip(share, 0.0, 1.0)
-        return cls(i, following, inside, share, delta, noise, whole, whole_noise, off)
+        return cls(i, following, inside, share, delta, noise, whole, whole_noise, slip)
 
     def noise_between(self) -> Array:
         """Covariances (n, 3, 3) given the states, along the axes of the one before.
@@ -148,6 +145,15 @@ class _Interval:
         s = self.share[:, None, None]
         whole = self.whole_noise + self.slip[:, :, None] * self.slip[:, None, :]
         return np.where(self.inside[:, None, None], s * (1 - s) * whole, self.noise)
+
+
+def _slips(moved: Array, odometry: Array, noise: Array) -> Array:
+    """What of motions (n, 3) is beyond those of odometry and their noise (n, 3, 3); 0 where not."""
+    off = moved - odometry
+    off[:, 2] = wrap(off[:, 2])
+    slips = (np.hypot(off[:, 0], off[:, 1]) > SLIP_M) | (np.abs(off[:, 2]) > SLIP_RAD)
+    slips &= mahalanobis_squared(off, noise + TINY) > SLIP
+    return np.where(slips[:, None], off, 0.0)
 
 
 def final_at(

@@ -117,8 +117,8 @@ def variance_sigma(redundancy: Array) -> Array:
     return np.asarray(1.0 / np.sqrt(redundancy.sum(axis=0) / 2.0 + PRIOR_LOG_SIGMA**-2))
 
 
-def with_fit_errors(config: OdometryConfig, log_sigma: Array) -> OdometryConfig:
-    """Settings whose noise counts in how well it is known: errors squared are as large on average.
+def with_fit_uncertainty(config: OdometryConfig, log_sigma: Array) -> OdometryConfig:
+    """Settings with rates enlarged for the uncertainty of their fit, so that NEES is 1 on average.
 
     A variance that ν residuals show is too small as often as too large, and where it is too small
     errors are out of all proportion: divided by it, they are squared ν / (ν - 2) on average. With

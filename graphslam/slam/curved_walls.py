@@ -45,4 +45,4 @@ def curved_share(seen: Sequence[Association]) -> float:
     middle = np.flatnonzero((sign[1:] == sign[:-1]) & (sign[1:] != 0)) + 2
     for k in (-1, 0, 1):
         bent[middle + k] = True
-    return float(bent.mean() * len(bent) / len(z))
+    return float(bent.sum() / len(z))

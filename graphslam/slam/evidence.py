@@ -121,6 +121,11 @@ class Evidence:
     observed: bool = True
     closures: ClosureMisfits | None = None
 
+    @property
+    def begin_ns(self) -> int:
+        """When the first odometry was read; 0 without any."""
+        return min((int(r.readings_ns[0]) for r in self.robots if len(r.readings_ns)), default=0)
+
 
 def gather(
     pipeline: LogPass,

@@ -22,7 +22,7 @@ from graphslam.odometry.noise_estimation import (
     is_stated,
     motion_variances,
     variance_sigma,
-    with_fit_errors,
+    with_fit_uncertainty,
 )
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
@@ -179,7 +179,7 @@ def fit_motion_noise(tracks: Mapping[str, Track], posterior: Posterior) -> LogNo
         else:
             fit = fit_track_noise(track, robot, posterior, relax=False)
             if fit is not None:
-                track.config = with_fit_errors(track.config, fit.log_sigma)
+                track.config = with_fit_uncertainty(track.config, fit.log_sigma)
     used = {name: track.config for name, track in tracks.items() if (name, MOTION) not in measured}
     return LogNoise(odometry=used, measured=measured)
 

@@ -19,6 +19,9 @@ from graphslam.slam.evidence import Evidence, Seen
 LEAST, LEAST_NS = 5, 2_000_000_000
 #: how far apart the places are, in median distances of the sightings from their own place
 APART = 5.0
+#: and in sigmas of a sighting, which by the noise that the log shows have grown with the move: where
+#: no range was measured, a robot that stands sees one place each time
+SIGMAS = 2.0
 
 
 def moved_doubts(evidence: Evidence) -> Iterator[Reason]:
@@ -27,16 +30,13 @@ def moved_doubts(evidence: Evidence) -> Iterator[Reason]:
     for robot in evidence.robots:
         for name, part in _by_name(robot.seen):
             parts[name].append(part)
-    origin_ns = min(
-        (int(r.readings_ns[0]) for r in evidence.robots if len(r.readings_ns)), default=0
-    )
     for name, own in sorted(parts.items()):
         times, at, weights = (np.concatenate(columns) for columns in zip(*own, strict=True))
         order = np.argsort(times, kind="stable")
         found = _moved(times[order], at[order], weights[order])
         if found is None:
             continue
-        last, first = (seconds(time, origin_ns) for time in (found.last_ns, found.first_ns))
+        last, first = (seconds(time, evidence.begin_ns) for time in (found.last_ns, found.first_ns))
         text = (
             f"the point {name}: its sightings until {last} agree on one place, and those since "
             f"{first} on another, {found.distance_m:.2f} m away: it was moved, or two bear its name"
@@ -84,6 +84,7 @@ def _moved(times_ns: IntArray, at: Array, weights: Array) -> _Move | None:
         for part, place in zip(parts, places, strict=True)
     )
     distance_m = float(np.hypot(*(places[1] - places[0])))
-    if distance_m < max(MOVED_M, APART * spread):
+    sigma_m = float(np.median(weights)) ** -0.5
+    if distance_m < max(MOVED_M, APART * spread, SIGMAS * sigma_m):
         return None
     return _Move(distance_m, int(times_ns[split - 1]), int(times_ns[split]))

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from graphslam.core.geometry import between
+from graphslam.core.geometry import Array, between
 from graphslam.slam.doubts import MOVED_M, MOVED_RAD, Reason, seconds
 from graphslam.slam.evidence import BoolArray, Evidence, IntTable, RobotEvidence
 
@@ -94,8 +94,7 @@ def _moved_unseen(robot: RobotEvidence, evidence: Evidence) -> Iterator[Reason]:
     pauses = np.array([_pause(robot, *span) for span in spans.tolist()]).reshape(-1, 2)
     least = max(UNSEEN_NS, UNSEEN_SCANS * float(np.median(np.diff(robot.scans_ns))))
     pauses = pauses[pauses[:, 1] - pauses[:, 0] >= least]
-    at = np.minimum(np.searchsorted(robot.readings_ns, pauses), len(robot.readings_ns) - 1)
-    moved = np.abs(between(robot.readings[at[:, 0]], robot.readings[at[:, 1]]))
+    moved = _by_odometry(robot, pauses)[:, 0]
     pauses = pauses[(np.hypot(moved[:, 0], moved[:, 1]) < HOP_M) & (moved[:, 2] < HOP_RAD)]
     if len(pauses):
         begin, end = min(pauses.tolist())
@@ -118,8 +117,7 @@ def _stood_unseen(robot: RobotEvidence, evidence: Evidence) -> Iterator[Reason]:
     long = np.flatnonzero(np.diff(robot.scans_ns) >= STOP_NS)
     begin, end = robot.scans_ns[long], robot.scans_ns[long + 1]
     times = np.column_stack([begin - SECOND_NS, begin, end, end + SECOND_NS])
-    at = np.minimum(np.searchsorted(robot.readings_ns, times), len(robot.readings_ns) - 1)
-    moved = np.abs(between(robot.readings[at[:, :-1]], robot.readings[at[:, 1:]]))
+    moved = _by_odometry(robot, times)
     # m, or rad where it turns: both are of the order of what a robot does in a second
     far = np.hypot(moved[:, :, 0], moved[:, :, 1]) + moved[:, :, 2]
     drove = np.minimum(far[:, 0], far[:, 2])
@@ -142,6 +140,12 @@ def _curved(robot: RobotEvidence) -> Iterator[Reason]:
             "odometry instead"
         )
         yield Reason("doubtful", "scans", robot.name, text)
+
+
+def _by_odometry(robot: RobotEvidence, times_ns: IntTable) -> Array:
+    """How far, m and rad (n, k, 3), a robot moved between consecutive ones of times (n, k + 1)."""
+    at = np.minimum(np.searchsorted(robot.readings_ns, times_ns), len(robot.readings_ns) - 1)
+    return np.abs(between(robot.readings[at[:, :-1]], robot.readings[at[:, 1:]]))
 
 
 def _is_elsewhere(robot: RobotEvidence, spans_ns: IntTable) -> BoolArray:

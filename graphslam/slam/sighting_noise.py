@@ -18,7 +18,7 @@ from graphslam.estimation.calibration_graph import CalibrationGraph
 from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
-from graphslam.odometry.noise_estimation import is_stated, with_fit_errors, without_floors
+from graphslam.odometry.noise_estimation import is_stated, with_fit_uncertainty, without_floors
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_noise import MOTION, LogNoise, has_state_at_every_sighting, is_white
 from graphslam.slam.motion_noise import NoiseFit, fit_track_noise, measured_motion_noise
@@ -153,7 +153,7 @@ def _estimated(
             break
     for name, fit in fits.items():
         if fit is not None:
-            tracks[name].config = with_fit_errors(tracks[name].config, fit.log_sigma)
+            tracks[name].config = with_fit_uncertainty(tracks[name].config, fit.log_sigma)
     for source, found in noise.items():
         measured[source] = found.white + found.shared
     final = {source: _cautious(found, config) for source, found in noise.items()}

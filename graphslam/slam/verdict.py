@@ -134,8 +134,7 @@ def _closures(evidence: Evidence) -> Iterable[Reason]:
     if found is None or not (found.d2 > CONTRADICTED_CLOSURE).any():
         return
     worst = int(np.argmax(found.d2))
-    first_ns = min(int(robot.readings_ns[0]) for robot in evidence.robots)
-    here, there = (seconds(int(time), first_ns) for time in found.times_ns[worst])
+    here, there = (seconds(int(time), evidence.begin_ns) for time in found.times_ns[worst])
     text = (
         f"the places at {here} and {there} are the same, but the path between them does not lead "
         f"back by {found.off_m[worst]:.2f} m: odometry slipped where no wall shows it, or they are "

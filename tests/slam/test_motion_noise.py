@@ -12,7 +12,7 @@ from graphslam.estimation.posterior_residuals import Residuals
 from graphslam.odometry.noise_estimation import (
     motion_variances,
     variance_sigma,
-    with_fit_errors,
+    with_fit_uncertainty,
     with_rates,
 )
 from graphslam.odometry.preintegration import Track
@@ -107,7 +107,7 @@ def test_errors_are_as_large_on_average_as_noise_that_few_residuals_show(count):
     rng = np.random.default_rng(0)
     shown = rng.chisquare(count, size=40_000) / count
     config = with_rates(OdometryConfig(), np.ones(len(RATES)))
-    wider = with_fit_errors(config, variance_sigma(np.ones((count, 3))))
+    wider = with_fit_uncertainty(config, variance_sigma(np.ones((count, 3))))
     for name in RATES:
         squared = np.mean(1.0 / (getattr(wider, name) * shown))
         assert squared == pytest.approx(1.0, abs=0.08)  # higher orders of 1 / count, and a prior

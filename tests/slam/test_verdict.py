@@ -11,6 +11,7 @@ from graphslam.core.geometry import between, compose, polar_points, transform_ea
 from graphslam.logs import LogWriter
 from graphslam.logs.time_order import TOO_LATE
 from graphslam.slam.evidence import ClosureMisfits, Evidence, RobotEvidence, Seen
+from graphslam.slam.moved_points import moved_doubts
 from graphslam.slam.path_evidence import FACTORS, PathMisfits
 from graphslam.slam.scan_evidence import Parked, _half_changed
 from graphslam.slam.verdict import judge, with_truth
@@ -168,6 +169,21 @@ def moved_point(own):
     moved = np.column_stack([np.arctan2(y, x), np.hypot(x, y)])
     d2 = np.where(late, 1e4, own.d2)
     return replace(own, z=np.where(late[:, None], moved, own.z), d2=d2)
+
+
+@pytest.mark.parametrize(("range_sigma_m", "doubts"), [(0.01, 1), (100.0, 0)])
+def test_a_point_whose_range_is_not_measured_has_not_moved(range_sigma_m, doubts):
+    """A robot that stands at two places sees it at two, if it takes the range that it is given."""
+    found = evidence()
+    own = found.robots[0].seen
+    late = (own.times_ns > S + 30 * S)[:, None]
+    poses = np.where(late, np.array([2.0, 0.0, 0.0]), np.zeros(3))
+    z = np.tile([0.1, 3.0], (len(own.z), 1))
+    sigmas = np.tile([0.01, range_sigma_m], (len(own.z), 1))
+    seen = replace(own, poses=poses, z=z, sigmas=sigmas, targets=0 * own.targets, names=("p",))
+    (robot,) = found.robots
+    told = list(moved_doubts(replace(found, robots=(replace(robot, seen=seen),))))
+    assert len(told) == doubts
 
 
 #: what is wrong, and what is said about it
