@@ -19,9 +19,6 @@ from graphslam.slam.evidence import Evidence, Seen
 LEAST, LEAST_NS = 5, 2_000_000_000
 #: how far apart the places are, in median distances of the sightings from their own place
 APART = 5.0
-#: and in sigmas of a sighting, which by the noise that the log shows have grown with the move: where
-#: no range was measured, a robot that stands sees one place each time
-SIGMAS = 2.0
 
 
 def moved_doubts(evidence: Evidence) -> Iterator[Reason]:
@@ -54,7 +51,12 @@ class _Move:
 
 
 def _by_name(seen: Seen) -> Iterator[tuple[str, tuple[IntArray, Array, Array]]]:
-    """Each named point with times (n,) of its sightings, their places (n, 2), and weights (n,)."""
+    """Each named point with times (n,) of its sightings, their places (n, 2), and weights (n,).
+
+    Only of sightings that tell a place, whose sigmas are below the range, and a radian: where no
+    range is measured, a robot that stands sees one place each time.
+    """
+    tells = (seen.sigmas[:, 1] < seen.z[:, 1]) & (seen.sigmas[:, 0] < 1.0)
     at = transform_each(seen.poses, polar_points(seen.z[:, 1], seen.z[:, 0]))
     across = seen.z[:, 1] * seen.sigmas[:, 0]
     weights = 1.0 / (across**2 + seen.sigmas[:, 1] ** 2)
@@ -62,6 +64,7 @@ def _by_name(seen: Seen) -> Iterator[tuple[str, tuple[IntArray, Array, Array]]]:
     edges = np.searchsorted(seen.targets[order], np.arange(len(seen.names) + 1))
     for name, begin, end in zip(seen.names, edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         own = order[begin:end]
+        own = own[tells[own]]
         if name and len(own):
             yield name, (seen.times_ns[own], at[own], weights[own])
 
@@ -84,7 +87,6 @@ def _moved(times_ns: IntArray, at: Array, weights: Array) -> _Move | None:
         for part, place in zip(parts, places, strict=True)
     )
     distance_m = float(np.hypot(*(places[1] - places[0])))
-    sigma_m = float(np.median(weights)) ** -0.5
-    if distance_m < max(MOVED_M, APART * spread, SIGMAS * sigma_m):
+    if distance_m < max(MOVED_M, APART * spread):
         return None
     return _Move(distance_m, int(times_ns[split - 1]), int(times_ns[split]))
