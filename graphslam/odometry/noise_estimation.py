@@ -123,14 +123,17 @@ def with_fit_uncertainty(config: OdometryConfig, log_sigma: Array) -> OdometryCo
     A variance that ν residuals show is too small as often as too large, and where it is too small
     errors are out of all proportion: divided by it, they are squared ν / (ν - 2) on average. With
     few residuals (ν is two over the squared sigma of the logarithm) that is far from 1. The
-    exponential, the same to first order, stays finite where next to nothing is known.
+    exponential, the same to first order, stays finite. It counts as far as the variance is that of
+    the residuals: where they tell nothing it is that of the default, which is as large as it is
+    meant to be.
 
     Args:
         config: settings as fitted.
         log_sigma: (3,) of the mean variances along x, y and of turning, see `variance_sigma`.
     """
     rates = np.array([getattr(config, name) for name in RATES])
-    return with_rates(config, rates * np.repeat(np.exp(log_sigma**2), 3))
+    by_residuals = 1.0 - (log_sigma / PRIOR_LOG_SIGMA) ** 2
+    return with_rates(config, rates * np.repeat(np.exp(log_sigma**2 * by_residuals), 3))
 
 
 def rates_of(twists: Array, seconds: Array, variances: Array) -> Array:
