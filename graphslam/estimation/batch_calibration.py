@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from graphslam.core.config import RobustConfig
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, between
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Motion, Step
+from graphslam.core.records import Estimate, Motion, Step, Trajectory
 from graphslam.estimation.calibration_graph import (
     CalibratedSolution,
     CalibrationGraph,
@@ -23,6 +23,7 @@ from graphslam.estimation.calibration_graph import (
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
+from graphslam.odometry.calibration_jacobian import at_estimated_motion
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.readings import IntArray
 
@@ -111,7 +112,7 @@ def calibrate_roughly(
     for _ in range(rounds):
         for name, track in tracks.items():
             track.calibration = now[name].held()
-        problem.calibrate_motions(recompute_motions(steps, tracks), now)
+        problem.calibrate_motions(recompute_motions(steps, tracks, estimate), now)
         estimate, now = problem.solve(CONVERGED_ERROR_ROUGH)
     for name, track in tracks.items():
         track.calibration = now[name]
@@ -133,7 +134,7 @@ def calibrate_so_far(
     try:
         for track in tracks.values():
             track.calibration = track.calibration.held()
-        made = recompute_motions(steps, tracks)
+        made = recompute_motions(steps, tracks, estimate)
     finally:
         for name, track in tracks.items():
             track.calibration = now[name]
@@ -144,28 +145,35 @@ def calibrate_so_far(
     return solved.estimate
 
 
-def recompute_motions(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:
+def recompute_motions(
+    steps: Sequence[Step], tracks: Mapping[str, Track], estimate: Estimate | None = None
+) -> tuple[Step, ...]:
     """Steps with motions by the tracks' calibration, except those from scan matching.
 
-    Where odometry does not cover a motion to its end, its covariance is that of the missing part,
-    which would be zero with the latency held.
+    What a calibration changes in them is as in the ``estimate`` of all their states, if there is
+    one, see `at_estimated_motion`. Where odometry does not cover a motion to its end, its
+    covariance is that of the missing part, which would be zero with the latency held.
     """
     motions: list[dict[str, Motion]] = [dict(step.motions) for step in steps]
     for robot, track in tracks.items():
         own = [made for made in motions if robot in made and not made[robot].from_scans]
-        recomputed = _recomputed([made[robot] for made in own], track)
+        states = estimate.states[robot] if estimate else None
+        recomputed = _recomputed([made[robot] for made in own], track, states)
         for made, motion in zip(own, recomputed, strict=True):
             made[robot] = motion
     return tuple(replace(step, motions=made) for step, made in zip(steps, motions, strict=True))
 
 
-def _recomputed(motions: Sequence[Motion], track: Track) -> list[Motion]:
+def _recomputed(motions: Sequence[Motion], track: Track, states: Trajectory | None) -> list[Motion]:
     """Motions of one robot by its track's calibration."""
     if not motions:
         return []
     ends = np.array([(m.start_ns, m.end_ns) for m in motions], dtype=np.int64)
     new = track.motions(*ends.T)
     new = dataclasses.replace(new, cov=new.cov + uncovered_covs(track, *ends.T))
+    if states is not None:
+        estimated = between(*(states.at(end) for end in ends.T))
+        new = dataclasses.replace(new, d_cal=at_estimated_motion(track, new, estimated))
     return [new.one(k, m.start_ns, m.end_ns) for k, m in enumerate(motions)]
 
 

@@ -325,6 +325,16 @@ class CalibrationGraph:
             raise builder.explain(error) from error
         return Posterior(self._steps, builder, self._values, blocks, free)
 
+    def weigh_lines(self) -> None:
+        """Give lines the noise that their residuals in the last solution show, from now on.
+
+        Raises:
+            EstimationError: it is indeterminate.
+        """
+        if self._builder.observes_walls:
+            self.line_noise = fit_line_noise(self.line_residuals())
+            self._builder.weigh_walls(self._values, self.line_noise)
+
     def line_residuals(self) -> LineResiduals:
         """Residuals of lines in the last solution.
 

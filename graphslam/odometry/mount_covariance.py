@@ -63,7 +63,12 @@ def with_mount_errors(
 
 
 def base_trajectory(
-    sensor: Trajectory, mount: Array, known: MountCovariance, states: Trajectory, before: IntArray
+    sensor: Trajectory,
+    mount: Array,
+    known: MountCovariance,
+    states: Trajectory,
+    before: IntArray,
+    share: Array,
 ) -> Trajectory:
     """Trajectory of a base whose sensor sits at ``mount`` (3,) in it, which is not exactly known.
 
@@ -73,13 +78,16 @@ def base_trajectory(
         known: covariances of the mount, and of ``states`` with it.
         states: of the sensor.
         before: (n,) index of the last state before each pose of ``sensor``.
+        share: (n,) of its covariance that is that of the state after it, see `final_at`.
     """
     back = inverse(mount)
     base = trajectory_of_mount(sensor, back)
     at = states.poses[before]
     carried, _ = compose_jacobians(at, between(at, sensor.poses))
     F, _ = compose_jacobians(sensor.poses, back)
-    cross = F @ carried @ known.states[before]
+    following = known.states[np.minimum(before + 1, len(known.states) - 1)]
+    s = share[:, None, None]
+    cross = F @ ((1 - s) * carried @ known.states[before] + s * following)
     moved = moved_by_mount(sensor.poses, mount)
     return replace(base, covs=_added(base.covs, cross, moved, known.mount)[0])
 

@@ -7,7 +7,7 @@ the map is known well enough to tell on which walls the returns are that are in 
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from graphslam.estimation.calibration_graph import (
     at_calibration,
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
+from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.settled import moved_to, settled
 from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.duplicate_landmarks import (
@@ -44,6 +45,7 @@ from graphslam.slam.log_noise import LogNoise
 from graphslam.slam.log_pass import timed
 from graphslam.slam.motion_noise import (
     fit_motion_noise,
+    middle_of_paths,
     noise_scales,
     scale_motion_noise,
 )
@@ -55,6 +57,10 @@ from graphslam.slam.scan_tracking import TrackedLog
 
 #: factors on the gates of re-association (across, direction): with the closed paths, and solved
 CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
+#: times that the noise of odometry is looked for, each by the one found before
+NOISE_ROUNDS = 2
+#: states by which it is, about
+NOISE_STATES = 800
 #: peak memory from which on what closing loops has freed is half of what a process holds
 LARGE_MB = 400.0
 
@@ -114,13 +120,32 @@ class _Problem:
         self._tracks, self._kernel = tracks, config.robust
         self._bias_m = config.front_end.floor_normal_m
         self._initial = {name: track.calibration for name, track in tracks.items()}
-        for track in tracks.values():
-            track.calibration = track.calibration.held()
-        made = recompute_motions(steps, tracks)
-        self._steps = scale_motion_noise(made, noise_scales(made, start))
+        self._steps = self._with_motions(steps, start)
         self._graph = CalibrationGraph(
             self._steps, start, priors, self._initial, config.robust, calibrated=True
         )
+
+    def _with_motions(self, steps: tuple[Step, ...], start: Estimate) -> tuple[Step, ...]:
+        for name, track in self._tracks.items():
+            track.calibration = self._initial[name].held()
+        made = recompute_motions(steps, self._tracks, start)
+        return scale_motion_noise(made, noise_scales(made, start))
+
+    def solutions(self) -> Iterator[Posterior]:
+        """Solutions with covariances, by the noise that the tracks have as each is asked for.
+
+        Lines are as noisy as they show themselves. With what the front end states, which is more in
+        most buildings, odometry would come out too exact: what both leave in residuals is known.
+        ``start`` has to be a solution.
+        """
+        graph = self._graph
+        graph.weigh_lines()
+        for k in range(NOISE_ROUNDS):
+            if k:
+                steps = self._with_motions(self._steps, graph.solution()[0])
+                graph.calibrate_motions(steps, self._initial)
+            graph.optimise(CONVERGED_ERROR_ROUGH)
+            yield graph.posterior()
 
     def solve_roughly(self) -> CalibratedSolution:
         """Without covariances, and ended early."""
@@ -150,6 +175,18 @@ class _Problem:
         return CalibratedSolution(estimate, calibrations, self._graph)
 
 
+def _motion_noise(
+    steps: Sequence[Step], solved: Estimate, tracks: Mapping[str, Track], config: Config
+) -> LogNoise:
+    """The noise of odometry, by the middle of a solved log; tracks get it, nothing else."""
+    before = {name: track.calibration for name, track in tracks.items()}
+    problem = _Problem(*middle_of_paths(steps, solved, NOISE_STATES), tracks, config)
+    noise = fit_motion_noise(tracks, problem.solutions())
+    for name, track in tracks.items():
+        track.calibration = before[name]
+    return noise
+
+
 def _solved(
     steps: tuple[Step, ...],
     start: Estimate,
@@ -161,10 +198,11 @@ def _solved(
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
     closures = list(paths.closures)
     steps = _tied(steps, start, None, paths, scan_log)
-    rough = _Problem(with_closures(steps, closures), start, tracks, config).solve_roughly()
+    closed = with_closures(steps, closures)
+    rough = _Problem(closed, start, tracks, config).solve_roughly()
     # all that follows needs nothing but this solution; the second process looks for the noise
     asked = (
-        Future(lambda: fit_motion_noise(tracks, rough.graph.posterior()))
+        Future(lambda: _motion_noise(closed, rough.estimate, tracks, config))
         if config.odometry.calibrate
         else None
     )

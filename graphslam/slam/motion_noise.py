@@ -6,7 +6,8 @@ are left to the solution. With the covariances of a solution: the settings of th
 themselves, each residual divided by what the solution leaves of its variance.
 """
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.motion_models import Increments
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Motion, Step
+from graphslam.core.records import Estimate, Motion, Start, Step, Trajectory
 from graphslam.estimation.posterior_residuals import Posterior, spans
 from graphslam.odometry.increment_sums import IncrementSums
 from graphslam.odometry.noise_estimation import (
@@ -32,6 +33,8 @@ from graphslam.slam.log_noise import MOTION, LogNoise
 MIN_MOTIONS = 50
 #: and with a prior (`fit_noise`): fewer hardly tell more than it
 FEW_MOTIONS = 8
+#: m, rad: sigmas of the pose at which a robot's part of a log begins
+BEGIN_SIGMA = 0.01
 #: m, rad: least sigma of a motion, in any direction
 MIN_SIGMA = 1e-4
 #: factor on stated sigmas from which a log contradicts them
@@ -155,6 +158,53 @@ def fit_track_noise(
     return NoiseFit(float(change[[0, 2]].max()), log_sigma)
 
 
+def middle_of_paths(
+    steps: Sequence[Step], estimate: Estimate, most: int
+) -> tuple[tuple[Step, ...], Estimate]:
+    """The middle of every robot's path, which begins at the estimate, and the estimate of that.
+
+    Without closures, whose other ends may be elsewhere.
+
+    Args:
+        steps: of a log.
+        estimate: of all their states.
+        most: states in all, about, evenly shared among the robots.
+    """
+    own: dict[str, list[int]] = defaultdict(list)
+    for n, step in enumerate(steps):
+        for robot in (*step.starts, *step.motions):
+            own[robot].append(n)
+    share = max(2, most // max(1, len(own)))
+    ranges = {}
+    for robot, numbers in own.items():
+        first = max(0, len(numbers) - share) // 2
+        ranges[robot] = numbers[first], numbers[first : first + share][-1]
+    cov = np.diag([BEGIN_SIGMA**2] * 3)
+    begun_ns: dict[str, int] = {}
+    made = []
+    for n, step in enumerate(steps):
+        inside = {robot for robot, (first, last) in ranges.items() if first <= n <= last}
+        starts = {
+            robot: Start(estimate.states[robot].at(step.time_ns), cov)
+            for robot in inside
+            if n == ranges[robot][0]
+        }
+        motions = {r: m for r, m in step.motions.items() if r in inside and r not in starts}
+        begun_ns |= dict.fromkeys(starts, step.time_ns)
+        # evidence from before a landmark's promotion may be of states before
+        seen = tuple(
+            a for a in step.associations if a.robot in inside and a.time_ns >= begun_ns[a.robot]
+        )
+        if starts or motions:
+            made.append(Step(step.time_ns, starts, motions, seen))
+    states = {}
+    for robot, (first, last) in ranges.items():
+        path = estimate.states[robot]
+        part = slice(*path.stamps_ns.searchsorted([steps[first].time_ns, steps[last].time_ns + 1]))
+        states[robot] = Trajectory(path.stamps_ns[part], path.poses[part], path.covs[part])
+    return tuple(made), replace(estimate, states=states)
+
+
 def measured_motion_noise(track: Track, robot: str, posterior: Posterior) -> Array | None:
     """Factors (3,) on a track's variances that its motions show over seconds; None if too few."""
     own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
@@ -168,18 +218,27 @@ def measured_motion_noise(track: Track, robot: str, posterior: Posterior) -> Arr
     return found.variance_factor() * np.median(found.variance / stated, axis=0)
 
 
-def fit_motion_noise(tracks: Mapping[str, Track], posterior: Posterior) -> LogNoise:
-    """`fit_track_noise` of all tracks; of those whose noise is stated what is measured."""
-    measured = {}
-    for robot, track in tracks.items():
-        if is_stated(track):
-            found = measured_motion_noise(track, robot, posterior)
-            if found is not None:
-                measured[robot, MOTION] = found
-        else:
-            fit = fit_track_noise(track, robot, posterior, relax=False)
-            if fit is not None:
-                track.config = with_fit_uncertainty(track.config, fit.log_sigma)
+def fit_motion_noise(tracks: Mapping[str, Track], solutions: Iterable[Posterior]) -> LogNoise:
+    """`fit_track_noise` of all tracks; of those whose noise is stated what is measured.
+
+    Args:
+        tracks: odometry of the robots.
+        solutions: each made when it is asked for, by the noise that the tracks have then. More than
+            one come nearer to noise that is far from that of the first.
+    """
+    stated = {robot for robot, track in tracks.items() if is_stated(track)}
+    measured: dict[tuple[str, str], Array] = {}
+    fits: dict[str, NoiseFit] = {}
+    for posterior in solutions:
+        for robot, track in tracks.items():
+            if robot in stated:
+                found = measured_motion_noise(track, robot, posterior)
+                measured |= {} if found is None else {(robot, MOTION): found}
+            else:
+                fit = fit_track_noise(track, robot, posterior, relax=False)
+                fits |= {} if fit is None else {robot: fit}
+    for robot, fit in fits.items():
+        tracks[robot].config = with_fit_uncertainty(tracks[robot].config, fit.log_sigma)
     used = {name: track.config for name, track in tracks.items() if (name, MOTION) not in measured}
     return LogNoise(odometry=used, measured=measured)
 

@@ -137,7 +137,7 @@ def reoptimise_scan_log(
         closed = with_closures(steps, closures)
 
         def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
-            made = recompute_motions(closed, tracks)
+            made = recompute_motions(closed, tracks, estimate)
             return scale_motion_noise(made, noise_scales(made, estimate))
 
         solved: list[CalibratedSolution] = []  # the last one
@@ -154,7 +154,7 @@ def reoptimise_scan_log(
             rough=len(tracks) == 1,
             solved_once=keep,
         )
-        noise = fit_motion_noise(tracks, solved[0].graph.posterior())
+        noise = fit_motion_noise(tracks, [solved[0].graph.posterior()])
         if len(tracks) > 1:
             # the world lies where the mount of the first robot puts it: a mount that this drive
             # does not tell would move the others away from where they started

@@ -202,7 +202,8 @@ class RobotState:
             base = trajectory_of_mount(final, inverse(self.track.mount))
         else:
             before = states.index_before(times)
-            base = base_trajectory(final, self.track.mount, mount, states, before)
+            share = np.zeros(len(times)) if ties is None else ties.share
+            base = base_trajectory(final, self.track.mount, mount, states, before, share)
         if self.scans:
             base = with_stamp_errors(base, self.track, times)
         at_start = compose(states.poses[0], inverse(self.track.mount))

@@ -21,7 +21,12 @@ from graphslam.estimation.residual_distribution import fit_distribution, shared_
 from graphslam.odometry.noise_estimation import is_stated, with_fit_uncertainty, without_floors
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.log_noise import MOTION, LogNoise, has_state_at_every_sighting, is_white
-from graphslam.slam.motion_noise import NoiseFit, fit_track_noise, measured_motion_noise
+from graphslam.slam.motion_noise import (
+    BEGIN_SIGMA,
+    NoiseFit,
+    fit_track_noise,
+    measured_motion_noise,
+)
 from graphslam.slam.sensor_latency import hold_insignificant_latency
 from graphslam.slam.sighting_states import (
     at_states,
@@ -40,8 +45,6 @@ CONVERGED_ERROR = 1e-4
 MIN_VARIANCE = 1e-4
 #: sightings without which nothing is said about a source
 MIN_MEASUREMENTS = 100
-#: m, rad: sigmas of the pose at which a robot's part of the stretch begins
-BEGIN_SIGMA = 0.01
 
 
 def estimate_noise(

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphslam.core.geometry import Array, between, compose, exp, inverse, log, wrap
+from graphslam.core.motion_models import HELD_SIGMA
 from graphslam.core.observation_models import transport
 from graphslam.core.records import (
     Association,
@@ -23,6 +24,7 @@ from graphslam.core.records import (
     Trajectory,
 )
 from graphslam.estimation.batch_calibration import uncovered_covs
+from graphslam.odometry.calibration_jacobian import at_estimated_motion
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.interpolation import IntArray, final_at
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, preintegrate_batch
@@ -222,12 +224,7 @@ def _at_least(cov: Array, variance: float) -> Array:
 def calibration_jacobian(
     track: Track, start_ns: IntArray, end_ns: IntArray, found: Motions, states: Trajectory
 ) -> Array:
-    """Derivative (n, 3, p) of motions by a track's calibration, at the estimated motion.
-
-    Odometry measures a motion with noise. Were the derivative taken where odometry puts it, that
-    noise would be in the residual and in the regressor, and scales would come out too small: the
-    estimated motion makes it total least squares (S. Van Huffel and J. Vandewalle, The Total Least
-    Squares Problem, 1991, DOI 10.1137/1.9781611971002).
+    """`at_estimated_motion` of motions whose sensor has a latency: (n, 3, p).
 
     Args:
         track: of a robot whose states are those of its base.
@@ -236,16 +233,10 @@ def calibration_jacobian(
         found: motions between them, as measured.
         states: the estimated ones.
     """
-    d_cal = found.d_cal
-    p = track.increment_parameters
-    if track.mount.any() or not d_cal.shape[2]:
-        return d_cal
-    d_cal = d_cal.copy()
-    a, b = states.at(start_ns), states.at(end_ns)
-    moved = between(a, b)
-    if p:
-        d_cal[:, :, :p] += track.derivative(log(moved)) - track.derivative(log(found.delta))
-    if track.is_mounted and not track.has_burst_stamps:
+    moved = between(states.at(start_ns), states.at(end_ns))
+    d_cal = at_estimated_motion(track, found, moved)
+    at_base = np.abs(track.mount).max() < HELD_SIGMA  # held, but solutions have rounding
+    if track.is_mounted and at_base and not track.has_burst_stamps:
         change = between(_earlier(states, start_ns), _earlier(states, end_ns)) - moved
         change[:, 2] = wrap(change[:, 2])
         d_cal[:, :, -1] = change * (1e9 / LATENCY_STEP_NS)

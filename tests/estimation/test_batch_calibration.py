@@ -109,14 +109,15 @@ def test_a_mount_is_what_the_log_says_and_the_deviations_that_are_reported(drawn
 
 
 def test_the_drive_through_a_room_shows_every_parameter(drawn):
-    """A fifth of the prior's sigma is left at most; wheels to 0.2 % of their radius, which is the
-    drift times the axle. The base is where it is to 2 cm though none of this was known."""
+    """A fifth of the prior's sigma is left at most; wheels to 0.26 % of their radius, which is the
+    drift times the axle: two of its sigmas over more runs, of 0.13 %. The base is where it is to
+    2 cm though none of this was known."""
     for errors, done in drawn:
         for name, prior in PRIOR.items():
             assert done.found[name]["observable"]
             assert done.found[name]["sigma"] < 0.2 * prior, name
         drift = done.found["drift_rad_per_m"]["value"] - errors["drift_rad_per_m"]
-        assert abs(drift) * load_scenario("lab").robots["vehicle"].encoders.axle_m < 2e-3
+        assert abs(drift) * load_scenario("lab").robots["vehicle"].encoders.axle_m < 2.6e-3
         assert np.hypot(done.off[:, 0], done.off[:, 1]).mean() < 0.02
 
 
@@ -194,16 +195,19 @@ def test_along_parallel_walls_nothing_is_invented(one_way):
     for done in one_way:
         path, cov = done.robot.final.poses[:, 0], done.robot.final.covs[:, 0, 0]
         scale = done.found["translation_scale"]
-        # of the scale they tell what the way across, between them, tells
-        assert scale["sigma"] > 0.4 * PRIOR["translation_scale"]
+        # of the scale they tell what the way across, between them, tells: more than half, if the
+        # scale would be another in each stretch nine tenths
+        assert scale["sigma"] > 0.2 * PRIOR["translation_scale"]
         assert np.sqrt(cov[-1]) == pytest.approx(scale["sigma"] * path[-1], rel=0.1)
         half = np.searchsorted(path, path[-1] / 2)
         assert np.sqrt(cov[half] / cov[-1]) == pytest.approx(0.5, abs=0.05)
 
 
 def test_across_parallel_walls_the_robot_is_held(one_way):
-    """Walls hold the offset to centimetres and the heading to milliradians, within 4 sigmas."""
+    """Walls hold the offset to centimetres and the heading to milliradians, within 4 sigmas. No
+    direction is known better than exactly, also between states, as far as the mount is in both."""
     for done in one_way:
+        assert np.linalg.eigvalsh(done.robot.final.covs).min() > 0.0
         sigma = np.sqrt(np.diagonal(done.robot.final.covs, axis1=1, axis2=2))
         assert np.abs(done.off[:, 1]).max() < 0.1 and np.abs(done.off[:, 2]).max() < 0.02
         assert (np.abs(done.off[10:, 1:]) < 4 * sigma[10:, 1:]).all()

@@ -52,7 +52,7 @@ def test_covariances_are_those_of_samples():
     )
     found = with_mount_errors(estimate, {"r": "r"}, {}, {"r": START}, {"r": MOUNT})
     own = found.mounts.of("r")
-    base = base_trajectory(found.states["r"], MOUNT, own, found.states["r"], stamps)
+    base = base_trajectory(found.states["r"], MOUNT, own, found.states["r"], stamps, np.zeros(6))
     sensors = compose(world_of(MOUNT + off)[:, None], poses + errors)
     bases = compose(sensors, inverse(MOUNT + off)[:, None])
     for seen, covs_of in ((sensors, found.states["r"].covs), (bases, base.covs)):
@@ -73,7 +73,9 @@ def test_the_base_begins_where_the_start_is_known_to_be():
     estimate = Estimate({"r": trajectory}, {}, 0.0, 0, mounts=known)
     found = with_mount_errors(estimate, {"r": "r"}, {}, {"r": START}, {"r": MOUNT})
     own = found.mounts.of("r")
-    base = base_trajectory(found.states["r"], MOUNT, own, found.states["r"], np.array([0]))
+    base = base_trajectory(
+        found.states["r"], MOUNT, own, found.states["r"], np.array([0]), np.zeros(1)
+    )
     # the prior is on the state, 0.3 m ahead: its direction of 0.02 rad moves the base about it by
     # 6 mm, beside 10 mm: 1.7 mm more in all
     assert np.sqrt(np.diag(base.covs[0])) == pytest.approx([0.01, 0.01, 0.02], abs=2e-3)
@@ -127,7 +129,8 @@ def test_robots_in_one_world_have_the_errors_of_the_mount_that_places_it():
         back = inverse(mounts[name] + errors[:, 20 + 3 * k : 23 + 3 * k])
         in_world[name] = compose(sensors, back[:, None])
         states = found.states[name]
-        base = base_trajectory(states, mounts[name], found.mounts.of(name), states, np.arange(3))
+        own = found.mounts.of(name)
+        base = base_trajectory(states, mounts[name], own, states, np.arange(3), np.zeros(3))
         for seen, covs in ((sensors, states.covs), (in_world[name], base.covs)):
             for n in range(3):
                 sample = np.cov(seen[:, n].T)

@@ -1,0 +1,67 @@
+"""What a calibration changes in motions is told by how the robot moved, not by noisy odometry."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.geometry import between, compose, exp
+from graphslam.core.motion_models import rows_of_twists
+from graphslam.core.records import OdometryPose, WheelAngles
+from graphslam.odometry.calibration_jacobian import at_estimated_motion
+from graphslam.odometry.preintegration import Track
+
+S = 1_000_000_000
+ROBOT = RobotConfig(wheel_radius_left_m=0.11, wheel_radius_right_m=0.1, axle_m=0.6)
+#: of a reading, ten in a second: a circle with a radius of 3 m
+TWIST, NOISE = np.array([0.05, 0.0, 0.05 / 3]), np.array([0.003, 0.0, 0.005])
+MOUNT = np.array([0.4, -0.1, 0.3])
+READINGS, STATE_EVERY = 1000, 5
+
+
+def track_of(source, twists, mount):
+    """Odometry of the given twists; a sensor that is mounted so, if it is."""
+    track = Track(OdometryConfig(), ROBOT, mounted=mount is not None)
+    times = (np.arange(len(twists) + 1) * (S // 10)).tolist()
+    if source == "wheels":
+        turns = rows_of_twists("wheels", twists, ROBOT)[:, :2]
+        angles = np.concatenate([np.zeros((1, 2)), np.cumsum(turns, axis=0)])
+        readings = [WheelAngles("r", t, t, *a) for t, a in zip(times, angles.tolist(), strict=True)]
+    else:
+        poses = [np.zeros(3)]
+        for motion in exp(twists):
+            poses.append(compose(poses[-1], motion))
+        readings = [OdometryPose("r", t, t, pose) for t, pose in zip(times, poses, strict=True)]
+    for reading in readings:
+        track.add(reading)
+    if mount is not None:
+        mean = track.calibration.mean.copy()
+        mean[-4:-1] = mount
+        track.calibration = replace(track.calibration, mean=mean)
+    return track
+
+
+@pytest.mark.parametrize("mount", [None, np.zeros(3), MOUNT], ids=["base", "centred", "mounted"])
+@pytest.mark.parametrize("source", ["poses", "wheels"])
+def test_noise_of_odometry_is_not_in_what_calibration_changes(source, mount):
+    """On a circle nothing tells turning too much from turning per metre driven, so both columns are
+    in proportion; those of noisy odometry are not, and residuals of the same noise have scales that
+    end at -1. What is left is of second order, and of where in a motion the noise was: a fifth of
+    what noise makes of the derivative at most."""
+    rng = np.random.default_rng(0)
+    twists = np.tile(TWIST, (READINGS, 1))
+    true = track_of(source, twists, mount)
+    noisy = track_of(source, twists + NOISE * rng.normal(size=twists.shape), mount)
+    ends = np.arange(1, READINGS // STATE_EVERY) * STATE_EVERY * (S // 10)
+    without, measured = (track.motions(ends[:-1], ends[1:]) for track in (true, noisy))
+    made = at_estimated_motion(noisy, measured, without.delta)
+    parameters = slice(0, noisy.increment_parameters + 3 * (mount is not None))
+    off = (measured.d_cal - without.d_cal)[:, :, parameters]
+    left = (made - without.d_cal)[:, :, parameters]
+    assert np.abs(off).max() > 0.0
+    assert np.sqrt(np.mean(left**2)) < 0.2 * np.sqrt(np.mean(off**2))
+    # the same noise in the residuals: what a column seems to explain of them
+    residual = between(measured.delta, without.delta)
+    size = np.abs(np.einsum("nip,ni->p", off, residual))
+    assert (np.abs(np.einsum("nip,ni->p", left, residual)) <= 0.2 * size + 1e-9).all()
