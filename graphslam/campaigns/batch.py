@@ -28,9 +28,9 @@ from graphslam.campaigns.one_log import (
     is_same_work,
     read_row,
 )
-from graphslam.campaigns.tasks import Outcome, Task, Workers, code_version, described
+from graphslam.campaigns.tasks import Outcome, Task, Workers, code_version
 from graphslam.core.config import Config
-from graphslam.core.errors import ConfigError, LogError, OutputError
+from graphslam.core.errors import ConfigError, LogError, OutputError, described
 from graphslam.logs.find_recordings import find_recordings
 from graphslam.results.file_formats import read_json, to_json
 from graphslam.results.report_batch import batch_page
@@ -42,6 +42,8 @@ OVERVIEW, PAGE, LOCK = "overview.json", "report.html", ".lock"
 PAGES = {"smooth": batch_page, "compare": comparisons_page}
 #: s; the overview is not written more often while logs are done
 WRITE_INTERVAL_S = 20.0
+#: the line of a log for which memory was short
+NO_MEMORY = "there is not enough memory; have fewer workers with more memory each"
 
 
 def run_batch(
@@ -160,7 +162,7 @@ def _kept(task: LogTask, retry: bool) -> Row | None:
 
 def _row(task: LogTask, outcome: Outcome) -> Row:
     if outcome.error is not None:
-        return failed_row(task, described(outcome.error))
+        return failed_row(task, described(outcome.error, NO_MEMORY))
     row: Row = outcome.value
     return row
 

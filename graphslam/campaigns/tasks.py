@@ -126,15 +126,3 @@ def machine_memory_mb() -> float:
 def code_version() -> str:
     """First digits of `source_digest`."""
     return source_digest()[:12]
-
-
-def described(error: BaseException) -> str:
-    """An error as one line that says what and where."""
-    if isinstance(error, GraphSlamError):
-        return str(error)
-    if isinstance(error, MemoryError):
-        return "there is not enough memory; have fewer workers with more memory each"
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'the system'}: {error.strerror}"
-    text = " ".join(str(error).splitlines())
-    return f"unexpected {type(error).__name__}: {text}; this is a defect of graphslam"

@@ -25,3 +25,18 @@ class EstimationError(GraphSlamError):
 
 class OutputError(GraphSlamError):
     """A result cannot be written or read; the message names the path."""
+
+
+def described(error: BaseException, of_memory: str = "there is not enough memory") -> str:
+    """An error of any kind as one line that says what and where; ``of_memory`` where that is out.
+
+    What nobody raised on purpose is told to be a defect.
+    """
+    if isinstance(error, GraphSlamError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        return of_memory
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'the system'}: {error.strerror}"
+    text = " ".join(str(error).splitlines())
+    return f"unexpected {type(error).__name__}: {text}; this is a defect of graphslam"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.errors import ConfigError, EstimationError, GraphSlamError, OutputError
+from graphslam.core.errors import ConfigError, EstimationError, OutputError, described
 from graphslam.core.geometry import Array, compose, transform, wrap
 from graphslam.core.records import Step, Trajectory
 from graphslam.evaluation.compare_variants import NAMES, Variant
@@ -26,6 +26,8 @@ from graphslam.slam.log_pass import Progress
 FORMAT = "graphslam-comparison-1"
 #: the same recorded steps for all, or each with its own data association
 MODES = ("replay", "associate")
+#: the error of a back end for which memory was short
+NO_MEMORY = "there is not enough memory; see the setting limits.memory_mb"
 #: tables of settings that the recorded steps depend on: in mode `replay` the same for all
 PERCEPTION = ("logs", "robots", "odometry", "keyframe", "front_end", "association", "start")
 
@@ -44,7 +46,7 @@ def compare(
 ) -> Comparison:
     """Run every back end of ``rows`` on one log, one after another.
 
-    A back end that fails has its error in its row, and the others go on.
+    A back end that fails, by whatever error, has it in its row, and the others go on.
 
     Args:
         log: opened logs.
@@ -82,7 +84,7 @@ def compare(
             config = replace(config, backend=replace(config.backend, name="isam2"))
         say(f"associating with {NAMES.get(config.backend.name, config.backend.name)}")
         shared = record_steps(log, config, progress)
-    runs: list[_BackendRun] = []
+    runs, failures = list[_BackendRun](), list[Exception]()
     for variant in rows:
         say(variant.label)
         try:
@@ -91,11 +93,14 @@ def compare(
                 # what the other back ends learned of the odometry is no merit of the odometry
                 recording = recording.with_recorded_odometry()
             runs.append(_BackendRun.of(variant, recording, run(recording.steps, variant.config)))
-        except GraphSlamError as error:
-            runs.append(_BackendRun(variant, error=str(error)))
+        except Exception as error:  # also a defect of one back end is no loss of the others
+            runs.append(_BackendRun(variant, error=described(error, NO_MEMORY)))
+            failures.append(error)
     done = [run for run in runs if run.result is not None]
     if not done:
-        raise EstimationError(f"every back end failed; {runs[0].variant.spec}: {runs[0].error}")
+        raise EstimationError(
+            f"every back end failed; {runs[0].variant.spec}: {runs[0].error}"
+        ) from failures[0]
     # the reference: batch, else a smoother, else the first
     reference = min(
         done,

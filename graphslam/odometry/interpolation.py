@@ -253,11 +253,16 @@ class FrameTransforms:
     landmarks: Mapping[int, Array]
 
     def estimate(self, estimate: Estimate) -> Estimate:
-        """The estimate in the new frame."""
+        """The estimate in the new frame; without landmarks that the map deleted.
+
+        A smoother keeps those: what was seen of them still ties states together.
+        """
         states = {n: transform_trajectory(t, self.robots[n]) for n, t in estimate.states.items()}
         landmarks = {}
         for number, (mean, cov) in estimate.landmarks.items():
-            world = self.landmarks[number]
+            world = self.landmarks.get(number)
+            if world is None:
+                continue
             M = rotation3(world[2])[: len(mean), : len(mean)]
             moved = compose(world, mean) if len(mean) == 3 else transform(world, mean)
             landmarks[number] = (moved, M @ cov @ M.T)
@@ -268,6 +273,8 @@ class FrameTransforms:
         """The same along the axes of the new frames."""
         landmarks = {}
         for number, cross in known.landmarks.items():
+            if number not in self.landmarks:
+                continue
             turn = rotation3(self.landmarks[number][2])[: len(cross), : len(cross)]
             landmarks[number] = turn @ cross
         states = {n: rotation3(self.robots[n][2]) @ c for n, c in known.states.items()}

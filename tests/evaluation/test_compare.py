@@ -294,6 +294,45 @@ def test_a_back_end_that_fails_has_its_error_in_its_row(two, broken):
         assert [bool(row) for row in cells] == [True, False, True]
 
 
+def test_landmarks_that_the_recording_deleted_are_in_no_map(tmp_path):
+    """A smoother keeps what a filter may drop; both have the map of the recording, which holds the
+    same landmarks whoever estimates them."""
+    drive(tmp_path / "log.mcap", seconds=20)
+    settings = [*START, "association.delete_s=3"]
+    log = open_logs([tmp_path / "log.mcap"], load_config(None, settings))
+    recorded = record_steps(log, load_config(None, settings))
+    assert any(step.deleted for step in recorded.steps)
+    rows = parse_variants(["ekf", "batch", "isam2"], load_config(None, settings))
+    found = rows_of(compare(log, load_config(None, settings), rows, run=timed_replay))
+    for row in found.values():
+        assert row["error"] is None
+        assert row["map_landmarks"] == sum(e.in_graph for e in recorded.landmarks.entries.values())
+    alone = compare(log, load_config(None, settings), rows[1:2], "associate", run=timed_replay)
+    assert alone.summary["rows"][0]["map_landmarks"] > 0
+
+
+class Defective(Broken):
+    """A back end with a defect: an error that nobody raises on purpose."""
+
+    def add(self, step):
+        try:
+            super().add(step)
+        except EstimationError:
+            raise KeyError(6) from None
+
+
+def test_a_defect_of_one_back_end_is_no_loss_of_the_others(two, monkeypatch):
+    """A comparison may have run for an hour by then; a comparison of nothing else ends with it."""
+    monkeypatch.setitem(BACKENDS, "batch", Defective)
+    rows = parse_variants(["isam2", "batch"], load_config(None, START))
+    found = rows_of(compare(two.log, two.config, rows, truth=two.truth, run=timed_replay))
+    assert found["isam2"]["error"] is None
+    assert found["batch"]["error"] == "unexpected KeyError: 6; this is a defect of graphslam"
+    with pytest.raises(EstimationError, match="batch: unexpected KeyError") as raised:
+        compare(two.log, two.config, rows[1:], run=timed_replay)
+    assert isinstance(raised.value.__cause__, KeyError)  # --debug shows where
+
+
 def test_nothing_is_left_where_every_back_end_fails(two, broken):
     with pytest.raises(EstimationError, match="every back end failed; batch: indeterminate"):
         compare(
