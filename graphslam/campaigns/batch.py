@@ -91,10 +91,10 @@ def run_batch(
         from graphslam.evaluation.compare_variants import parse_variants  # noqa: PLC0415
 
         parse_variants(backends, config)
-    config = _with_known_map(config, backends)
+    config, known_map = _with_known_map(config, backends)
     specs, mode = tuple(backends), mode if backends else ""
     tasks = [
-        LogTask(name, os.fspath(path), root, config, force, specs, mode)
+        LogTask(name, os.fspath(path), root, config, force, specs, mode, known_map)
         for name, path in found.recordings
     ]
     with _locked(directory, "compare" if backends else "smooth"):
@@ -118,17 +118,21 @@ def run_batch(
     return content
 
 
-def _with_known_map(config: Config, backends: Sequence[str]) -> Config:
-    """The settings with a known map, if any, where workers find it; it can be read."""
+def _with_known_map(config: Config, backends: Sequence[str]) -> tuple[Config, str]:
+    """The settings with a known map, if any, where workers find it, and its SHA-256.
+
+    It can be read; without one the latter is empty.
+    """
     if not config.known_map.directory:
-        return config
+        return config, ""
     if backends:
         raise ConfigError("known_map.directory: back ends are compared without a known map")
     from graphslam.results.known_map import known_map_of  # noqa: PLC0415
 
-    known_map_of(config)
+    known = known_map_of(config)
     directory = os.fspath(Path(config.known_map.directory).resolve())
-    return replace(config, known_map=replace(config.known_map, directory=directory))
+    config = replace(config, known_map=replace(config.known_map, directory=directory))
+    return config, known.sha256 if known else ""
 
 
 def make_result(task: LogTask) -> Row:

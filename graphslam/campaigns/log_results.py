@@ -9,6 +9,7 @@ import numpy as np
 from graphslam.campaigns.one_log import MAP, LogTask, Row, do_log
 from graphslam.campaigns.tasks import forget_peak_memory
 from graphslam.core.config import Config
+from graphslam.core.errors import OutputError
 from graphslam.core.records import Result, Step
 from graphslam.evaluation.compare_backends import compare
 from graphslam.evaluation.compare_folder import save_comparison
@@ -29,9 +30,16 @@ def work_on_log(task: LogTask) -> Row:
 
 
 def _smooth(task: LogTask, folder: Path) -> Row:
-    """Write a result folder with a small map."""
+    """Write a result folder with a small map.
+
+    Raises:
+        OutputError: the known map is no longer that which the row would name.
+    """
     log = open_logs([Path(task.path)], task.config)
     known_map = known_map_of(task.config)
+    if known_map is not None and known_map.sha256 != task.known_map:
+        folder_of_map = task.config.known_map.directory
+        raise OutputError(f"{folder_of_map}: has changed since the batch began; call it again")
     result = smooth(log, task.config, known_map=known_map)
     errors = errors_of_run(result, truth_of_logs(log))
     report = render(result, errors)

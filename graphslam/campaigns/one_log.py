@@ -41,7 +41,8 @@ class LogTask:
     """A recording at ``path``, of which ``results/NAME`` in ``directory`` is made.
 
     ``again``: also if that is done already. ``backends``: to be compared, see `parse_variants`;
-    none: it is smoothed. ``mode``: of a comparison.
+    none: it is smoothed. ``mode``: of a comparison. ``known_map``: SHA-256 of the map that the
+    settings name, of which they hold only the folder; empty without one.
     """
 
     name: str
@@ -51,6 +52,7 @@ class LogTask:
     again: bool = False
     backends: tuple[str, ...] = ()
     mode: str = ""
+    known_map: str = ""
 
     @property
     def target(self) -> Path:
@@ -65,7 +67,8 @@ def identify(task: LogTask) -> Row:
         LogError: the files cannot be looked at.
     """
     compared = f"{task.backends} {task.mode}" if task.backends else ""
-    settings = hashlib.sha256((dump_config(task.config) + compared).encode()).hexdigest()
+    asked = dump_config(task.config) + compared + task.known_map
+    settings = hashlib.sha256(asked.encode()).hexdigest()
     return {
         "name": task.name,
         "path": task.path,

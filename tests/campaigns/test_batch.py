@@ -19,7 +19,7 @@ from graphslam.campaigns.one_log import LogTask, failed_row, read_row
 from graphslam.campaigns.tasks import Outcome
 from graphslam.cli import arguments
 from graphslam.core.config_io import load_config
-from graphslam.core.errors import LogError
+from graphslam.core.errors import LogError, OutputError
 from graphslam.logs.find_recordings import find_recordings
 from graphslam.results.folder import load
 
@@ -100,6 +100,17 @@ def test_logs_of_a_batch_are_localised_in_a_known_map(tmp_path, monkeypatch):
     known = json.loads((folder / "summary.json").read_text())["known_map"]
     assert known["name"] == "monday" and known["seen"] > 3
     assert (folder / "known_map.npz").exists()
+    again = ("batch", "logs", "-o", "out", *at, "--json")
+    assert json.loads(call(*again).out)["counts"]["done_now"] == 0
+    # the map made anew under the same name: all that is made in it must be, too
+    moved = ("--force", "--start", "robot=1,0,0")
+    assert call("smooth", "monday.mcap", "-o", "monday", *moved).code == 0
+    assert json.loads(call(*again).out)["counts"]["done_now"] == 1
+    anew = json.loads((folder / "summary.json").read_text())["known_map"]
+    assert anew["sha256"] != known["sha256"]
+    stale = LogTask("x", "logs/tuesday.mcap", str(tmp_path / "out"), load_config(None, at[1:2]))
+    with pytest.raises(OutputError, match="monday: has changed since the batch began"):
+        work_on_log(stale)
     wrong = call("batch", "logs", "-o", "other", "--set", "known_map.directory=nowhere")
     check_one_line(wrong)
     assert "nowhere" in wrong.err and not Path("other").exists()
