@@ -21,6 +21,8 @@ from graphslam.core.errors import OutputError
 from graphslam.evaluation.monte_carlo_bench import run_seed
 from graphslam.evaluation.monte_carlo_campaign import Job, Row, list_jobs, run_job
 from graphslam.evaluation.monte_carlo_definition import Definition
+from graphslam.simulation import SCENARIOS, ScenarioError
+from graphslam.simulation.scenario_files import scenario_sha256
 
 ROWS, DEFINITION = "results.jsonl", "definition.json"
 
@@ -171,7 +173,19 @@ def _identity(definition: Definition) -> str:
     }
     if tree["logs"]:
         del tree["logs"]["diverged_m"]  # of the summary only
+        # files of the user's have only their names there; those of the package are of its version
+        own = [name for name in tree["logs"]["scenarios"] if name not in SCENARIOS]
+        if own:
+            tree["logs"]["sha256"] = {name: _content(name) for name in own}
     return json.dumps(tree, indent=1, sort_keys=True) + "\n"
+
+
+def _content(scenario: str) -> str | None:
+    """What identifies a scenario's content; None of one that cannot be read, as its rows say."""
+    try:
+        return scenario_sha256(scenario)
+    except ScenarioError:
+        return None
 
 
 def _read(path: Path) -> Iterator[tuple[Job, Row]]:

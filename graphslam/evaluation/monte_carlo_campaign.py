@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.config import Config
+from graphslam.core.memory_limit import limited_memory
 from graphslam.evaluation.monte_carlo_bench import draw_run, run_seed
 from graphslam.evaluation.monte_carlo_bench_run import run_bench
 from graphslam.evaluation.monte_carlo_definition import Definition
@@ -50,17 +52,23 @@ def run_job(definition: Definition, job: Job) -> Row:
     """The results of a run, as a row without its identification.
 
     Raises:
-        GraphSlamError: the run failed.
+        GraphSlamError: the run failed, or needed more memory than its settings allow.
     """
+    # other messages are lost in every run of the bench, which has no front end
+    more = f"network.seed={job.run}" if definition.bench else f"front_end.name={job.front_end}"
+    config = definition.config(job.variant, more)
+    with limited_memory(config.limits.memory_mb):
+        return _run(definition, job, config)
+
+
+def _run(definition: Definition, job: Job, config: Config) -> Row:
+    """What a run of these settings gives."""
     sequence = run_seed(definition.seed, job.scale, job.run)
     if definition.bench is not None:
         rng = np.random.default_rng(sequence)
         slip = definition.bench.slip
         told = slip is not None and job.variant in slip.told
-        run = draw_run(definition.bench, job.scale, rng, told=told)
-        # other messages are lost in every run
-        return run_bench(run, definition.config(job.variant, f"network.seed={job.run}"))
-    config = definition.config(job.variant, f"front_end.name={job.front_end}")
+        return run_bench(draw_run(definition.bench, job.scale, rng, told=told), config)
     if definition.chapter is not None:
         with scratch_folder() as folder:
             experiment = EXPERIMENTS[job.scenario]

@@ -1,11 +1,14 @@
 """Scenario files: those of the package and the user's own."""
 
+import hashlib
+import json
 import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from graphslam.core.suggestions import did_you_mean
 from graphslam.simulation.scenario import (
@@ -32,6 +35,38 @@ def load_scenario(scenario: str | Path) -> Scenario:
         ScenarioError: no such name or file, not TOML, or a key or value is wrong; the message
             names the file and the key.
     """
+    path, tree = _read(scenario)
+    try:
+        parsed: Scenario = build(Scenario, tree)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path.name}: {error}") from error
+    if parsed.world_of:
+        parsed = _with_world_of(parsed, path)
+    for problem in _inconsistencies(parsed):
+        raise ScenarioError(f"{path.name}: {problem}")
+    return replace(parsed, name=path.name)
+
+
+def scenario_sha256(scenario: str | Path) -> str:
+    """What a scenario says, as a SHA-256: of its file and those whose world it uses.
+
+    Comments and the order of keys change nothing. The scenario can be loaded, see `load_scenario`.
+
+    Raises:
+        ScenarioError: a file cannot be read.
+    """
+    path, tree = _read(scenario)
+    trees = [tree]
+    while named := tree.get("world_of"):
+        path, tree = _read(_world_file(path, named))
+        if tree in trees:  # in a circle; it cannot be loaded
+            break
+        trees.append(tree)
+    return hashlib.sha256(json.dumps(trees, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _read(scenario: str | Path) -> tuple[Path, dict[str, Any]]:
+    """The file of a scenario and its keys, as they are there."""
     path = SCENARIOS.get(str(scenario), Path(scenario))
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -44,25 +79,22 @@ def load_scenario(scenario: str | Path) -> Scenario:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{path}: not valid TOML: {error}") from error
-    try:
-        parsed: Scenario = build(Scenario, tree)
-    except ScenarioError as error:
-        raise ScenarioError(f"{path.name}: {error}") from error
-    if parsed.world_of:
-        parsed = _with_world_of(parsed, path)
-    for problem in _inconsistencies(parsed):
-        raise ScenarioError(f"{path.name}: {problem}")
-    return replace(parsed, name=path.name)
+    return path, tree
+
+
+def _world_file(path: Path, world_of: str) -> str | Path:
+    """The scenario whose world that of ``path`` uses: a file beside it, else one of its own."""
+    beside = path.parent / world_of
+    return beside if beside.is_file() else world_of
 
 
 def _with_world_of(scenario: Scenario, path: Path) -> Scenario:
     """The scenario with the world of another one, whose file may be in the same folder."""
     if scenario.world != StaticObjects():
         raise ScenarioError(f"{path.name}: give either world or world_of")
-    beside = path.parent / scenario.world_of
-    if beside == path:
+    if path.parent / scenario.world_of == path:
         raise ScenarioError(f"{path.name}: world_of: names the file itself")
-    other = load_scenario(beside if beside.is_file() else scenario.world_of)
+    other = load_scenario(_world_file(path, scenario.world_of))
     return replace(scenario, world=other.world)
 
 

@@ -19,13 +19,14 @@ from small_experiment import SMALL
 
 from graphslam.campaigns import experiment as campaign
 from graphslam.campaigns.experiment import run_campaign
-from graphslam.campaigns.tasks import Workers
+from graphslam.campaigns.tasks import Outcome, Workers
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError, LogError, OutputError
 from graphslam.core.geometry import between, compose, exp, rotation3
 from graphslam.core.observation_models import MODELS
 from graphslam.estimation.backend import JointMarginal
 from graphslam.evaluation import cramer_rao_bound as bound
+from graphslam.evaluation import monte_carlo_campaign
 from graphslam.evaluation.monte_carlo_bench import Noise, draw_run, planned_path, run_seed
 from graphslam.evaluation.monte_carlo_campaign import Job, run_job
 from graphslam.evaluation.monte_carlo_consistency import joint_errors, joint_nees
@@ -44,7 +45,7 @@ from graphslam.evaluation.monte_carlo_log_run import (
 from graphslam.evaluation.monte_carlo_summary import bootstrap_interval, summarise
 from graphslam.logs import open_logs
 from graphslam.results.report_experiment import experiment_figures, experiment_page
-from graphslam.simulation import load_scenario, simulate
+from graphslam.simulation import SCENARIOS, load_scenario, simulate
 from graphslam.slam.start_priors import start_poses
 
 WHOLE = load_definition("ekf-versus-smoothing")
@@ -409,6 +410,37 @@ def test_a_folder_of_something_else_is_left_alone(small, tmp_path):
     with pytest.raises(OutputError, match="not the folder of an experiment"):
         run_campaign(small, tmp_path, force=True)
     assert (tmp_path / "mine.txt").read_text() == "x"
+
+
+def test_an_experiment_in_another_world_is_another_one(tmp_path, monkeypatch):
+    """Also if only the file beside it says so, whose world it uses; comments say nothing."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        campaign, "run_tasks", lambda tasks, *_: (Outcome(task, value={}) for task in tasks)
+    )
+    lab = SCENARIOS["lab"].read_text(encoding="utf-8")
+    wider = lab.replace("[10.0, 8.0]", "[10.5, 8.0]")
+    assert wider != lab
+    world, robots = tmp_path / "world.toml", tmp_path / "robots.toml"
+    world.write_text(lab, encoding="utf-8")
+    robots.write_text('world_of = "world.toml"\n' + lab[lab.index("[robots.") :], encoding="utf-8")
+    logs = Logs(scenarios=("robots.toml", "lab"))
+    definition = Definition(variants={"isam2": ()}, runs=1, logs=logs, name="own")
+    run_campaign(definition, tmp_path / "a")
+    world.write_text(lab + "# the same\n", encoding="utf-8")
+    more = replace(definition, runs=2)
+    assert len(run_campaign(more, tmp_path / "a")) == 4
+    world.write_text(wider, encoding="utf-8")
+    with pytest.raises(OutputError, match="an earlier definition of this one"):
+        run_campaign(more, tmp_path / "a")
+
+
+def test_a_limit_on_memory_holds_for_each_run(small, monkeypatch):
+    # 4.3 GB; the limit leaves this process, and threads of who runs the tests, what they have
+    monkeypatch.setattr(monte_carlo_campaign, "run_bench", lambda *_: bytearray(1 << 32))
+    limited = replace(small, variants={"batch": ("limits.memory_mb=3000",)})
+    with pytest.raises(LogError, match=r"more memory than limits\.memory_mb \(3000\)"):
+        run_job(limited, Job("", "", 0.1, "batch", 0))
 
 
 def test_a_run_that_fails_is_a_row_with_its_error_and_is_counted(tmp_path):
