@@ -9,7 +9,7 @@ import shutil
 import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +24,7 @@ from graphslam.campaigns.one_log import (
     LogTask,
     Row,
     failed_row,
+    has_failed,
     identify,
     is_same_work,
     read_row,
@@ -111,7 +112,7 @@ def run_batch(
                 row = _row(by_label[outcome.task.label], outcome)
                 overview.add(row)
                 progress(len(rows), len(tasks))
-                if row["status"] == "failed":
+                if has_failed(row):
                     announce(f"{row['name']}: {row['error']}")
         finally:
             content = overview.write()
@@ -156,7 +157,7 @@ def kind_of(directory: Path) -> str | None:
 def _kept(task: LogTask, retry: bool) -> Row | None:
     """The row of a log that need not be done."""
     row = read_row(task.target)
-    if row is None or (retry and row.get("status") == "failed"):
+    if row is None or (retry and has_failed(row)):
         return None
     try:
         return row if is_same_work(row, identify(task)) else None
@@ -226,7 +227,9 @@ class _Overview:
             "code": code_version(),
             "counts": {
                 "logs": len(logs),
-                **{name: _count(logs, name) for name in ("done", "failed", "waiting")},
+                "done": sum(not has_failed(row) for row in done),
+                "failed": sum(map(has_failed, logs)),
+                "waiting": sum(row["status"] == "waiting" for row in logs),
                 "done_now": len(self._new),
                 **{name: verdicts[name] for name in ("good", "doubtful", "bad")},
             },
@@ -264,10 +267,6 @@ class _Overview:
             return (self._directory / RESULTS / name / MAP).read_text(encoding="utf-8")
         except OSError:
             return ""
-
-
-def _count(rows: Sequence[Mapping[str, Any]], status: str) -> int:
-    return sum(row["status"] == status for row in rows)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import OutputError
 from graphslam.core.records import Result, Step
 from graphslam.evaluation.compare_backends import compare
-from graphslam.evaluation.compare_folder import save_comparison
+from graphslam.evaluation.compare_folder import failed_backends, save_comparison
 from graphslam.evaluation.compare_variants import parse_variants
 from graphslam.evaluation.ground_truth import errors_of_run, truth_of_logs
 from graphslam.evaluation.timed_replay import TimedReplay, timed_replay
@@ -63,6 +63,7 @@ def _compare(task: LogTask, folder: Path) -> Row:
     drawn = {name: path.poses[:, :2] for name, path in paths.items()}
     (folder / MAP).write_text(draw(drawn, ()), encoding="utf-8")
     return {
+        "error": failed_backends(found) or None,  # the folder holds the others
         "robots": sorted(log.robots),
         "warnings": list(found["warnings"]),
         "reference": found["reference"],

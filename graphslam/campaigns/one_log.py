@@ -139,6 +139,11 @@ def read_row(target: Path) -> Row | None:
     return row if isinstance(row, dict) else None
 
 
+def has_failed(row: Mapping[str, Any]) -> bool:
+    """Whether there is no result of a log, or one of a comparison in which a back end failed."""
+    return row.get("error") is not None
+
+
 def put_row(task: LogTask, row: Row) -> Row:
     """Replace the row of a result that stays.
 
@@ -155,8 +160,12 @@ def put_row(task: LogTask, row: Row) -> Row:
 
 
 def _is_done(row: Mapping[str, Any], asked: Mapping[str, Any]) -> bool:
-    """Whether the same contents were smoothed with these settings by this code."""
-    if row.get("status") != "done" or row.get("config_sha256") != asked["config_sha256"]:
+    """Whether all was made of the same contents with these settings by this code."""
+    if (
+        row.get("status") != "done"
+        or has_failed(row)
+        or row.get("config_sha256") != asked["config_sha256"]
+    ):
         return False
     contents = [[file["sha256"] for file in one["files"]] for one in (row, asked)]
     return row.get("code") == asked["code"] and contents[0] == contents[1]

@@ -149,6 +149,7 @@ def compare(
     by itself, as batch does it, with one overview.
     """
     from graphslam.cli import show
+    from graphslam.evaluation.compare_folder import failed_backends
 
     specs = [spec for spec in backends.split(",") if spec]
     tree = load_config(config, smoothing_settings(None, front_end, start, settings), preset)
@@ -165,9 +166,7 @@ def compare(
             output=output, force=force, progress=progress, announce=show.stage,
         )  # fmt: skip
     found = comparison.summary
-    failed = [f"{row['spec']}: {row['error']}" for row in found["rows"] if row["error"]]
-    failure = f"{len(failed)} of {len(found['rows'])} back ends failed; " if failed else ""
-    return Output(found, lambda: show.comparison(found, output), failure + "".join(failed[:1]))
+    return Output(found, lambda: show.comparison(found, output), failed_backends(found))
 
 
 def _compare_each(

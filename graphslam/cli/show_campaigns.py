@@ -44,9 +44,9 @@ def comparisons(found: Mapping[str, Any], directory: Path) -> None:
 
 
 def _end(console: Console, found: Mapping[str, Any], directory: Path) -> None:
-    """What failed, how much is done, and where the overview is."""
+    """What failed as a whole, how much is done, and where the overview is."""
     for row in found["logs"]:
-        if row["error"]:
+        if row["error"] and "backends" not in row:
             console.print(f"failed: {row['name']}: {row['error']}")
     counts = found["counts"]
     new = f", {counts['done_now']} of them now" if counts["done_now"] < counts["logs"] else ""

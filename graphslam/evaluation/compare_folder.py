@@ -1,8 +1,9 @@
 """The folder of a comparison: compare.json, config.toml and report.html."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import dump_config
@@ -19,6 +20,16 @@ def is_comparison(directory: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(found, dict) and str(found.get("format", "")).startswith("graphslam-comp")
+
+
+def failed_backends(found: Mapping[str, Any]) -> str:
+    """How many back ends of a comparison failed, and the line of the first; empty if none did.
+
+    ``found``: what compare.json holds.
+    """
+    failed = [f"{row['spec']}: {row['error']}" for row in found["rows"] if row["error"]]
+    count = f"{len(failed)} of {len(found['rows'])} back ends failed"
+    return f"{count}; {failed[0]}" if failed else ""
 
 
 def save_comparison(

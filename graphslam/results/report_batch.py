@@ -214,7 +214,9 @@ def overview_page(
 
 
 def state_of(row: Row) -> str:
-    """One of `STATES`: the verdict of what is done, else the status."""
+    """One of `STATES`: the verdict of what is done, if nothing of it failed, else the status."""
+    if row["error"]:
+        return "failed"
     return str((row["status"] == "done" and row.get("verdict")) or row["status"])
 
 
@@ -282,11 +284,11 @@ def _row(row: Row, drawing: str, columns: Sequence[Column]) -> str:
         name = f"<b>{name}</b>"
     backends = row.get("backends", {}).items()
     failed = [f"{spec}: {one['error']}" for spec, one in backends if one["error"]]
-    told = [row["error"]] if row["error"] else [*failed, *row.get("reasons", ())]
+    told = failed or [row["error"] or "", *row.get("reasons", ())]
     told += row.get("warnings", ())
     # a report tells of no machine
     files = [row["path"], *(file["path"] for file in row.get("files", ()))]
-    why = escape(html.without_folders("; ".join(dict.fromkeys(told)), files))
+    why = escape(html.without_folders("; ".join(dict.fromkeys(filter(None, told))), files))
     values = [column.value(row) for column in columns]
     data = "".join(
         f' data-c{k}="{"" if value is None else value}"' for k, value in enumerate(values)

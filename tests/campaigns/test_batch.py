@@ -289,6 +289,27 @@ def test_back_ends_are_compared_on_each_log_by_the_same_engine(fleet, tmp_path):
     assert "not the folder of such a batch" in check_one_line(wrong)
 
 
+def test_a_back_end_that_fails_on_a_log_is_said_counted_and_done_again(fleet, tmp_path):
+    """As of `compare` on that log alone: what it says, its exit code, and the other back end."""
+    options = ("--mode", "associate", "--backends", "batch,ekf+limits.landmarks=3", "--json")
+    alone = call("compare", fleet.logs / "a.mcap", "-o", tmp_path / "alone", *options)
+    assert alone.code == 1
+    line = re.search(r"1 of 2 back ends failed; ekf\+limits\.landmarks=3: .*", alone.err)
+    command = ("compare", fleet.logs / "a.mcap", "--each", "-o", tmp_path / "out", *options)
+    done = call(*command)
+    assert done.code == 1 and f"1 of 1 logs failed; a: {line[0]}" in done.err
+    (row,) = json.loads(done.out)["logs"]
+    assert row["status"] == "done" and row["error"] == line[0]
+    assert row["backends"]["batch"]["error_m"] > 0  # the folder has the other one
+    page = (tmp_path / "out/report.html").read_text()
+    assert '<tr data-is="failed"' in page and 'href="results/a/report.html"' in page
+    for more, done_now in ((), 0), (("--retry",), 1):
+        again = call(*command, *more)
+        counts = json.loads(again.out)["counts"]
+        assert again.code == 1 and (counts["failed"], counts["done"]) == (1, 0)
+        assert counts["done_now"] == done_now
+
+
 def test_workers_are_for_many_logs_and_truth_for_one(fleet, tmp_path):
     log, out = fleet.logs / "a.mcap", tmp_path / "x"
     assert call("compare", log, "-o", out, "--jobs", "2").code == 2
