@@ -12,6 +12,9 @@ from graphslam.results.occupancy_grid import GridMap
 #: grey values in mode trinary
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 MODES = ("trinary", "scale")
+#: occupied_thresh and free_thresh of each mode: what is above the one is 100, below the other 0. In
+#: mode scale map_server stretches what is between them, so that only these leave it as it is
+THRESHOLDS = {"trinary": (0.65, 0.196), "scale": (1.0, 0.0)}
 
 
 def grid_map_files(grid: GridMap, name: str, mode: str) -> list[tuple[str, str | bytes]]:
@@ -69,9 +72,9 @@ def _pgm(image: NDArray[Any]) -> bytes:
 
 
 def _yaml(image: str, mode: str, cell_m: float, origin_m: tuple[float, float], meaning: str) -> str:
-    x, y = origin_m
+    (x, y), (occupied, free) = origin_m, THRESHOLDS[mode]
     return (
         f"# {meaning}\nimage: {image}\nmode: {mode}\nresolution: {cell_m:.6g}\n"
         f"origin: [{x:.6f}, {y:.6f}, 0.0]\nnegate: 0\n"
-        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        f"occupied_thresh: {occupied}\nfree_thresh: {free}\n"
     )
