@@ -254,6 +254,7 @@ def make_map(
 
     Raises:
         OutputError: it is no result folder, a file exists, or nothing can be written there.
+        ConfigError: the map would have too many cells of ``resolution_m``.
     """
     from graphslam.results.map_files import make_map
 

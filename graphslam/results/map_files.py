@@ -67,6 +67,7 @@ def make_map(
     Raises:
         OutputError: it is no result folder, a file exists, or the disk refuses; the files that
             were there before are then left as they were.
+        ConfigError: the map would have too many cells of ``resolution_m``.
     """
     saved = load(directory)
     scans = read_scans(directory / SCANS_FILE)

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array, compose, transform
 from graphslam.results.scans_file import PlacedScan
 
@@ -67,14 +68,37 @@ def fan(scan: PlacedScan) -> Fan:
 def cell_size(fans: Sequence[Fan]) -> float:
     """Edge of a cell, m: as fine as beams lie beside each other, as coarse as a map has room.
 
-    The median distance of beams where they end, rounded up to one of `SIZES_M`.
+    The distance of beams where they end, rounded up to one of `SIZES_M`.
     """
+    return _from_sizes(max(_beam_spacing(fans), _finest(fans)))
+
+
+def _from_sizes(least: float) -> float:
+    """The first of `SIZES_M` that is not below ``least``; where none is so large, ``least``."""
+    return next((size for size in SIZES_M if size >= least), least)
+
+
+def _beam_spacing(fans: Sequence[Fan]) -> float:
+    """Four fifths of the median distance of neighbouring beams where they end, m."""
     sample = [f.ends - f.sensor for f in fans[:: 1 + len(fans) // 200] if len(f.ends) > 1]
     spaces = [np.hypot(*ends.T) * _usual_angle(ends) for ends in sample]
-    space = float(np.median(np.concatenate([np.zeros(1), *spaces])))
+    return 0.8 * float(np.median(np.concatenate([np.zeros(1), *spaces])))
+
+
+def _finest(fans: Sequence[Fan]) -> float:
+    """Edge of a cell, m, with which the map has at most `MOST_CELLS`, wherever cells begin."""
     low, high = _bounds(fans)
-    fewest = float(np.sqrt(np.prod(high - low) / MOST_CELLS))
-    return next((s for s in SIZES_M if s >= max(0.8 * space, fewest)), max(SIZES_M[-1], fewest))
+    width, height = (high - low).tolist()
+    half = width + height
+    # (width / size + 2) (height / size + 2) cells at most
+    most = MOST_CELLS - 4
+    return float((half + np.sqrt(half**2 + most * width * height)) / most)
+
+
+def _rounded_up(value: float) -> float:
+    """A positive number to two digits, not below it."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(np.ceil(value / unit) * unit)
 
 
 def _turns(offset: Array) -> Array:
@@ -97,11 +121,13 @@ def _bounds(fans: Sequence[Fan]) -> tuple[Array, Array]:
 class OccupancyGrid:
     """Counts of cells; cell (i, j) is over x from i ``cell_m``, y from j ``cell_m``.
 
+    ``joins_ends``: the surface between two ends is hit as they are; else a scan has no vote there.
     ``tiles[a, b]`` is (hits, passes), each (TILE, TILE) with rows along y, from cell
     (a TILE, b TILE).
     """
 
     cell_m: float
+    joins_ends: bool = False
     tiles: dict[tuple[int, int], tuple[Counts, Counts]] = field(default_factory=dict)
 
     def add(self, scan: Fan) -> None:
@@ -118,8 +144,12 @@ class OccupancyGrid:
         fixed = np.round(((corners / self.cell_m - low) - 0.5) * (1 << SHIFT)).astype(np.int32)
         cv2.fillPoly(passed, [fixed], 1, shift=SHIFT)
         surface = fixed[1::2].copy()  # OpenCV takes no strides
-        cv2.polylines(passed, [surface[a:b] for a, b in border], False, 0, shift=SHIFT)
+        surfaces = [surface[a:b] for a, b in border]
         hit = np.zeros_like(passed)
+        if self.joins_ends:
+            cv2.polylines(hit, surfaces, False, 1, shift=SHIFT)
+        else:
+            cv2.polylines(passed, surfaces, False, 0, shift=SHIFT)
         hit[ends[:, 1] - low[1], ends[:, 0] - low[0]] = 1
         passed[hit > 0] = 0
         for key, tile, part in self._parts(low, passed.shape):
@@ -149,11 +179,14 @@ class OccupancyGrid:
         NaN where no beam has been.
         """
         known = {key: (h > 0) | (p > 0) for key, (h, p) in self.tiles.items()}
-        inner = [(np.array(key) * TILE, np.argwhere(seen)[:, ::-1]) for key, seen in known.items()]
+        inner = [
+            np.array(key) * TILE + [[along[0], up[0]], [along[-1], up[-1]]]
+            for key, seen in known.items()
+            for along, up in [(np.flatnonzero(seen.any(axis=0)), np.flatnonzero(seen.any(axis=1)))]
+        ]
         if not inner:
             return np.full((1, 1), np.nan, dtype=np.float32), (0, 0)
-        low = np.min([origin + cells.min(axis=0) for origin, cells in inner], axis=0)
-        high = np.max([origin + cells.max(axis=0) for origin, cells in inner], axis=0)
+        low, high = np.min(inner, axis=(0, 1)), np.max(inner, axis=(0, 1))
         columns, rows = (high - low + 1).tolist()
         made = np.full((rows, columns), np.nan, dtype=np.float32)
         for (a, b), (hits, passes) in self.tiles.items():
@@ -229,20 +262,33 @@ class GridMap:
 def grid_map(scans: Sequence[PlacedScan], cell_m: float | None = None) -> GridMap:
     """The map of some scans with cells of ``cell_m``, by default as the scans allow.
 
+    Where cells are finer than beams lie beside each other, much of a surface is between ends: it
+    is taken for hit there.
+
     Space that is free, but that nothing free joins to a sensor, was seen through what is occupied
     (an error of range or pose on the far side of a wall): it is unknown.
+
+    Raises:
+        ConfigError: the map would have more than `MOST_CELLS` cells.
     """
     fans = [fan(scan) for scan in scans]
     size = cell_size(fans) if cell_m is None else cell_m
-    counts = OccupancyGrid(size)
+    finest = _finest(fans)
+    if size < finest:
+        raise ConfigError(
+            f"--resolution {size:g}: the map would have more than {MOST_CELLS} cells; the finest "
+            f"possible is {_rounded_up(finest):g}"
+        )
+    counts = OccupancyGrid(size, joins_ends=size < _from_sizes(_beam_spacing(fans)))
     for one in fans:
         counts.add(one)
     log_odds, low = counts.log_odds()
     free = log_odds < FREE
-    _, part = cv2.connectedComponents(free.astype(np.uint8), connectivity=4)
+    count, part = cv2.connectedComponents(free.astype(np.uint8), connectivity=4)
     sensors = np.array([one.sensor for one in fans]).reshape(-1, 2)
     at = np.floor(sensors / size).astype(np.int64) - np.array(low)
     inside = ((at >= 0) & (at < np.array(free.shape[::-1]))).all(axis=1)
-    reached = np.unique(part[at[inside, 1], at[inside, 0]])
-    log_odds[free & ~np.isin(part, reached)] = np.nan
+    reached = np.zeros(count, dtype=np.bool_)
+    reached[part[at[inside, 1], at[inside, 0]]] = True
+    log_odds[free & ~reached[part]] = np.nan
     return GridMap(log_odds, size, (low[0] * size, low[1] * size))

@@ -10,11 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command_line import call, check_one_line
 from maps import map_errors
 from synthetic_results import orchard, room
 from walls import rectangles
 
-from graphslam.core.errors import OutputError
+from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import compose, polar_points
 from graphslam.results import occupancy_grid
 from graphslam.results.folder import save
@@ -146,6 +147,59 @@ def test_tiles_do_not_show(tile, monkeypatch):
     for away in ([0, 0, 0], [1e4, 1e4, 0]):
         counts.add(fan(replace(scans[0], pose=scans[0].pose + away)))
     assert len(counts.tiles) * (tile * 0.05) ** 2 < 4 * (9 + 2 * tile * 0.05) ** 2
+
+
+@pytest.mark.parametrize("cell_m", [0.025, 0.01])
+def test_walls_have_no_holes_where_cells_are_finer_than_beams(cell_m):
+    """Beams are 5 cm apart here, ends and poses a centimetre off. Of the cells of a map as the
+    scans allow, 5 cm, in which a wall is, hardly any shows free space and no wall in the finer map:
+    a twentieth, where a wall at a cell's edge is in the next one. And what is drawn between ends
+    is a wall: within 8 cm, four sigmas, of a true one."""
+    rng = np.random.default_rng(3)
+    scans = scans_in(ROOMS, drive(40), rng, 0.01)
+    noise = [0.01, 0.01, 0.002]
+    scans = [
+        replace(s, pose=s.pose + rng.normal(0, noise), points=s.points[::3].copy()) for s in scans
+    ]
+    coarse, fine = grid_map(scans), grid_map(scans, cell_m)
+    assert coarse.cell_m == 0.05
+
+    def within(cells):
+        """Which cells of the coarse map (rows, columns) hold such ones of the fine map."""
+        found = np.zeros(coarse.log_odds.shape, dtype=bool)
+        j, i = np.nonzero(cells)
+        middle = np.column_stack([i + 0.5, j + 0.5]) * cell_m + fine.origin_m
+        x, y = np.floor((middle - coarse.origin_m) / coarse.cell_m).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < found.shape[1]) & (y < found.shape[0])
+        found[y[inside], x[inside]] = True
+        return found
+
+    walls = within(fine.occupied)
+    holes = coarse.occupied & ~walls & within(fine.free)
+    assert holes.sum() < 0.05 * coarse.occupied.sum()
+    j, i = np.nonzero(fine.occupied)
+    at = (np.column_stack([i, j]) + 0.5) * cell_m + fine.origin_m
+    begin, along = ROOMS[:, 0], np.diff(ROOMS, axis=1)[:, 0]
+    off = at[:, None] - begin
+    share = np.clip((off * along).sum(axis=-1) / (along**2).sum(axis=-1), 0, 1)
+    assert np.linalg.norm(off - share[..., None] * along, axis=-1).min(axis=1).max() < 0.08
+
+
+def test_a_map_has_at_most_so_many_cells(saved, monkeypatch, tmp_path):
+    """Refused in a line that names a resolution which is possible, and hardly finer ones are; by
+    itself a map of two robots far apart has the cells for which there is room."""
+    scan = scans_in(ROOMS, drive(1))[0]
+    monkeypatch.setattr(occupancy_grid, "MOST_CELLS", 250_000)
+    with pytest.raises(ConfigError, match=r"--resolution 0\.01: .* more than 250000 cells") as said:
+        grid_map([scan], 0.01)
+    finest = float(str(said.value).rpartition(" ")[2])
+    cells = grid_map([scan], finest).log_odds.size
+    assert 200_000 < cells <= 250_000  # two digits are a tenth at most, of the area a fifth
+    for away in ([3000, 0, 0], [2100, 2100, 0], [1e6, 3e5, 0]):
+        both = grid_map([scan, replace(scan, pose=scan.pose + away)])
+        assert both.log_odds.size <= 250_000
+    out = check_one_line(call("map", saved[0], "--resolution", "0.001", "-o", tmp_path / "a"))
+    assert "the finest possible is 0.0" in out and not (tmp_path / "a").exists()
 
 
 def test_an_order_of_scans_is_as_good_as_another():
