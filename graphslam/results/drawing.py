@@ -27,6 +27,7 @@ from graphslam.results.drawing_elements import (
 from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 
 TEXT_PT, TICK_TEXT_PT, LEGEND_ROW_PT = 8.5, 8.0, 10.0
+_LONGEST_SAMPLE_PT = 13.0  # of a curve in a legend, up to its name
 _LETTER = 0.6  # mean width of a letter, of the height of the text
 _BESIDE = 5.0  # points that a number may stand out beside the axis
 _FAR = 10**6  # user units: what lies beyond is cut off anyway
@@ -290,12 +291,17 @@ def legend_height(entries: Sequence[tuple[str, Style]], left: float, right: floa
     return LEGEND_ROW_PT * len(_legend_rows(entries, left, right)) if entries else 0.0
 
 
-def _sample(style: Style) -> float:
-    """Length of the sample of a curve, user units: about 11 points, and whole dashes."""
+def _sample(style: Style) -> tuple[float, Style]:
+    """Length of the sample of a curve, user units: about 11 points, and whole dashes; its style.
+
+    Long dashes are drawn shorter, where the name would be in the way.
+    """
     dashes = [style.width * dash for dash in style.dashes]
     if not dashes:
-        return 11.0 * UNIT
-    return UNIT * (max(1, round((11.0 - dashes[0]) / sum(dashes))) * sum(dashes) + dashes[0])
+        return 11.0 * UNIT, style
+    length = max(1, round((11.0 - dashes[0]) / sum(dashes))) * sum(dashes) + dashes[0]
+    scale = min(1.0, _LONGEST_SAMPLE_PT / length)
+    return UNIT * scale * length, style._replace(dashes=tuple(scale * d for d in style.dashes))
 
 
 def legend(entries: Sequence[tuple[str, Style]], left: float, right: float, y: float) -> list[str]:
@@ -307,9 +313,8 @@ def legend(entries: Sequence[tuple[str, Style]], left: float, right: float, y: f
     for row in reversed(_legend_rows(entries, left, right)):
         x = right - sum(width for *_, width in row)
         for name, style, width in row:
-            found.append(
-                stroked(f"M{x + 8 * UNIT:.0f} {y - 3 * UNIT:.0f}h{_sample(style):.0f}", style)
-            )
+            length, sample = _sample(style)
+            found.append(stroked(f"M{x + 8 * UNIT:.0f} {y - 3 * UNIT:.0f}h{length:.0f}", sample))
             found.append(words(name, x + 23 * UNIT, y, TICK_TEXT_PT))
             x += width
         y -= LEGEND_ROW_PT * UNIT

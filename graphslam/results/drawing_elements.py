@@ -24,6 +24,8 @@ FAINT = "#d5d9de"
 ACCENT = "#c8601a"
 #: One colour a robot, told apart with any colour vision: P. Tol, Colour schemes, SRON/EPS/TN/09-002
 PALETTE = ("#4477aa", "#ee6677", "#228833", "#aa3377", "#ccbb44", "#66ccee")
+#: dashes of paths, in widths, by how often the colours were all taken before
+DASHES = ((), (4, 2), (1, 1.5), (5, 1.5, 1, 1.5), (10, 2.5), (6, 1.5, 1, 1.5, 1, 1.5))
 #: colour of the light page -> what follows the page
 THEMED = {INK: "currentColor", FAINT: "var(--grid)", ACCENT: "var(--accent)"} | {
     color: f"var(--robot{i})" for i, color in enumerate(PALETTE)
@@ -62,6 +64,11 @@ class Box(NamedTuple):
 def robot_color(index: int) -> str:
     """Colour of the robot with this number in alphabetical order."""
     return PALETTE[index % len(PALETTE)]
+
+
+def robot_dashes(index: int) -> tuple[float, ...]:
+    """Dashes of this robot's path: with its colour they tell it from all of three dozen robots."""
+    return DASHES[index // len(PALETTE) % len(DASHES)]
 
 
 def svg_element(

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ COLORS = {INK: "ink", ACCENT: "accent"} | {c: f"robot{i}" for i, c in enumerate(
 class Series:
     """What is drawn with one glyph: ``columns`` (n,) of numbers, at least x and y, in its layer.
 
+    ``dash``: by name, or lengths in pixels of what is drawn and left out in turn.
     ``glyph``: "path" (one line), "lines" or "areas" (one from each vertex ``starts`` (m,) on),
     "ellipses" (columns width, height m, angle rad) or "points" (``marker``). ``tip``: HTML of what
     hovering shows, ``@name`` a column or one of ``texts``. ``side``: "before" or "after" the swipe.
@@ -47,7 +49,7 @@ class Series:
     columns: Mapping[str, Array]
     width: float = 1.5
     alpha: float = 1.0
-    dash: str = "solid"
+    dash: str | Sequence[float] = "solid"
     marker: str = "circle"
     starts: Array | None = None
     texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -182,14 +184,24 @@ def _controls(figure: LiveFigure) -> str:
 
 
 def _swatch(figure: LiveFigure, layer: str) -> str:
-    """The colour of a layer that has one."""
+    """The colour of a layer that has one, dashed as its first curve is."""
     colors = {COLORS.get(one.color, one.color) for one in figure.series if one.layer == layer}
     colors |= {one["color"] for one in figure.clouds if one["layer"] == layer}
     if figure.scans and figure.scans["layer"] == layer:
         colors |= set(figure.scans["colors"])
     if len(colors) != 1:
         return ""
-    return f'<i class=lane style="background:var(--{colors.pop()})"></i>'
+    color = f"var(--{colors.pop()})"
+    dash = next((one.dash for one in figure.series if one.layer == layer), "solid")
+    if isinstance(dash, str):
+        return f'<i class=lane style="background:{color}"></i>'
+    ends = [0.0, *np.cumsum(dash).tolist()]
+    stops = [
+        f"{'transparent' if k % 2 else color} {a:g}px {b:g}px"
+        for k, (a, b) in enumerate(pairwise(ends))
+    ]
+    drawn = f"repeating-linear-gradient(90deg,{','.join(stops)})"
+    return f'<i class="lane dashed" style="background:{drawn}"></i>'
 
 
 def scripts() -> str:

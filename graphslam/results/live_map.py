@@ -5,9 +5,9 @@ import numpy as np
 
 from graphslam.core.geometry import Array
 from graphslam.core.records import Result, Trajectory
-from graphslam.core.thinning import rows_to_the_last
+from graphslam.core.thinning import rows_along, rows_to_the_last
 from graphslam.results import report_maps as maps
-from graphslam.results.drawing_elements import ACCENT, INK, robot_color
+from graphslam.results.drawing_elements import ACCENT, INK, robot_color, robot_dashes
 from graphslam.results.live_figure import (
     COLORS,
     LiveFigure,
@@ -22,6 +22,10 @@ from graphslam.results.report_tables import landmark_sigma
 
 #: of all scans, poses and ellipses together: more would make the page large or slow
 _MAX_POINTS, _MAX_POSES, _MAX_ELLIPSES = 250_000, 4000, 60
+#: poses at even intervals of one robot at least, at which the replay has it
+_LEAST_POSES = 250
+#: m: how far what is drawn is from a path; and most poses of all robots that this may need
+_WITHIN_M, _MOST_POSES = 0.01, 20_000
 _SCANS, _LANDMARKS, _ELLIPSES = "scans", "landmarks", "95 % ellipses"
 _CLOSURES, _CAUSAL = "loop closures", "causal"
 
@@ -82,24 +86,26 @@ def _paths(result: Result, name: str, index: int, clock: _Clock) -> list[Series]
     """Final path with its poses, causal path, and odometry alone, of one robot."""
     robot, color = result.robots[name], robot_color(index)
     layer = "paths" if len(result.robots) == 1 else name
-    most = max(2, _MAX_POSES // len(result.robots))
-    final = _thinned(robot.final, most)
+    count = len(result.robots)
+    final = _followed(robot.final, count)
     named = "" if len(result.robots) == 1 else f"<b>{tip_text(name)}</b> "
     worst = 100 * maps.worst_sigma(final.covs)
     turn = np.degrees(np.sqrt(np.maximum(final.covs[:, 2, 2], 0.0)))
-    found = []
+    found, dash = [], [2.0 * length for length in robot_dashes(index)] or "solid"
     if robot.dead_reckoning is not None:
-        path = _path(_thinned(robot.dead_reckoning, most), clock)
+        path = _path(_followed(robot.dead_reckoning, count), clock)
+        look = 1.5, 0.9, dash
         found.append(
-            Series("path", layer, color, path, 1.5, 0.9, side="before", timed=True, robot=True)
+            Series("path", layer, color, path, *look, side="before", timed=True, robot=True)
         )
     if robot.causal is not None:
-        path = _path(_thinned(robot.causal, most), clock)
-        found.append(Series("path", _CAUSAL, color, path, 1.0, 0.6, side="after", timed=True))
+        path = _path(_followed(robot.causal, count), clock)
+        found.append(Series("path", _CAUSAL, color, path, 1.0, 0.6, dash, side="after", timed=True))
     path = _path(final, clock)
     path |= {"clock": clock.shown(path["time"]), "sigma": worst, "turn": turn}
     tip = f"{named}at {clock.text}<br>position σ @sigma{{0.0}} cm<br>heading σ @turn{{0.00}}°"
-    found.append(Series("path", layer, color, path, 2.0, 0.9, side="after", timed=True, robot=True))
+    look = 2.0, 0.9, dash
+    found.append(Series("path", layer, color, path, *look, side="after", timed=True, robot=True))
     # discs that are not seen, only pointed at
     poses = {name: column for name, column in path.items() if name != "heading"}
     found.append(Series("points", layer, color, poses, 7.0, 0.0, tip=tip, side="after", timed=True))
@@ -111,9 +117,19 @@ def _path(path: Trajectory, clock: _Clock) -> dict[str, Array]:
     return {"x": x, "y": y, "heading": heading, "time": clock.seconds(path.stamps_ns)}
 
 
+def _followed(path: Trajectory, robots: int) -> Trajectory:
+    """Poses of a path, of one of so many robots, that follow it closely; some at even intervals."""
+    even = max(_LEAST_POSES, _MAX_POSES // robots)
+    most = max(even, _MOST_POSES // robots)
+    return _rows(path, rows_along(path.poses[:, :2], _WITHIN_M, even, most))
+
+
 def _thinned(path: Trajectory, most: int) -> Trajectory:
     """At most ``most`` poses at even intervals, with the last one."""
-    chosen = rows_to_the_last(len(path), most)
+    return _rows(path, rows_to_the_last(len(path), most))
+
+
+def _rows(path: Trajectory, chosen: Stamps) -> Trajectory:
     return Trajectory(path.stamps_ns[chosen], path.poses[chosen], path.covs[chosen])
 
 

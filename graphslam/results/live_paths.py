@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.core.thinning import evenly_thinned, rows_to_the_last
+from graphslam.core.thinning import rows_along
 from graphslam.results.drawing_elements import INK, Style
 from graphslam.results.live_figure import LiveFigure, Series, tip_text
 from graphslam.results.report_html import MINUTES_FROM_S
@@ -13,9 +13,14 @@ from graphslam.results.report_html import MINUTES_FROM_S
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from numpy.typing import NDArray
+
     from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve, TimedPath
 
-_MAX_POSES = 3000  # of one back end and kind, all robots together
+#: of one back end and kind, all robots together: at even intervals, and at most
+_MAX_POSES, _MOST_POSES = 3000, 9000
+#: poses at even intervals of one robot at least; and m: how far what is drawn is from a path
+_LEAST_POSES, _WITHIN_M = 250, 0.01
 _TRUTH = "the truth"
 #: which side of the swipe a kind of trajectory is on
 _SIDES = {"causal": "before", "final": "after"}
@@ -47,7 +52,7 @@ def live_paths(
         dash = "dashed" if style.dashes else "solid"
         for kind, side in _SIDES.items():
             for name, path in backend.paths[kind].items():
-                columns = _columns(path, start_ns, max(2, _MAX_POSES // len(backend.paths[kind])))
+                columns = _columns(path, start_ns, len(backend.paths[kind]))
                 series.append(
                     Series(
                         "path", backend.label, style.color, columns, style.width, 0.9, dash,
@@ -70,7 +75,7 @@ def live_paths(
                     )
                 )  # fmt: skip
     for xy in comparison.truth.values():
-        kept = evenly_thinned(xy, _MAX_POSES)
+        kept = xy[_followed(xy, len(comparison.truth))]
         truth = {"x": kept[:, 0], "y": kept[:, 1]}
         series.append(Series("path", _TRUTH, INK, truth, 1.0, 0.9, "dashed"))
     return LiveFigure(
@@ -83,9 +88,15 @@ def live_paths(
     )  # fmt: skip
 
 
-def _columns(path: "TimedPath", start_ns: int, most: int) -> dict[str, Array]:
-    """At most ``most`` poses at even intervals, with the last one."""
-    chosen = rows_to_the_last(len(path.stamps_ns), most)
+def _followed(points: Array, robots: int) -> "NDArray[np.int64]":
+    """Rows of a path (n, 2), of one of so many robots, that follow it; some at even intervals."""
+    even = max(_LEAST_POSES, _MAX_POSES // robots)
+    return rows_along(points, _WITHIN_M, even, max(even, _MOST_POSES // robots))
+
+
+def _columns(path: "TimedPath", start_ns: int, robots: int) -> dict[str, Array]:
+    """Poses that follow a path, of one of so many robots, and their times, s."""
+    chosen = _followed(path.poses[:, :2], robots)
     x, y, heading = path.poses[chosen].T
     time = (path.stamps_ns[chosen] - start_ns) / 1e9
     return {"x": x, "y": y, "heading": heading, "time": time}

@@ -8,7 +8,7 @@ from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, interpolate, path_length, unit_vectors
 from graphslam.core.records import Landmark, Result, Trajectory
 from graphslam.results.drawing import Axes
-from graphslam.results.drawing_elements import ACCENT, INK, Style, robot_color
+from graphslam.results.drawing_elements import ACCENT, INK, Style, robot_color, robot_dashes
 from graphslam.results.report_figure import WIDTH_IN, Drawing, density, map_axes, svg
 
 MAX_LABELS = 40
@@ -51,7 +51,7 @@ def overview(result: Result, height_in: float, *, dead_reckoning: bool) -> str:
                 axes.image(density(cloud, limits, robot_color(i)), limits)
         several = len(paths) > 1
         for i, (name, path) in enumerate(paths.items()):
-            style = Style(robot_color(i) if several else ACCENT, 0.9)
+            style = Style(robot_color(i) if several else ACCENT, 0.9, dashes=robot_dashes(i))
             axes.path(path.poses[:, :2], style, name if several else None)
         _draw_landmarks(axes, landmarks, 1.0)
 
@@ -101,11 +101,12 @@ def trajectory_map(result: Result, height_in: float) -> tuple[str, int]:
         axes = map_axes(drawing, limits)
         one = len(robots) == 1
         for i, (name, robot) in enumerate(robots):
-            color = robot_color(i)
+            color, dashes = robot_color(i), robot_dashes(i)
             if robot.causal is not None:
                 causal = Style(INK if one else color, 0.5, 0.4)
                 axes.path(robot.causal.poses[:, :2], causal, "causal" if one else None)
-            axes.path(robot.final.poses[:, :2], Style(color, 1.1), "final" if one else name)
+            final = Style(color, 1.1, dashes=dashes)
+            axes.path(robot.final.poses[:, :2], final, "final" if one else name)
             axes.symbols(robot.final.poses[:1, :2], color, 5.5)
         axes.lines(ellipses, Style(ACCENT, 0.7))
 

@@ -49,6 +49,7 @@ svg .halo { paint-order: stroke; stroke: var(--card); stroke-width: 25px;
   font-size: .85rem; }
 .live-layers { display: flex; flex-wrap: wrap; gap: 4px 14px; align-items: center; }
 .live-layers i.lane { margin: 0 5px 0 3px; }
+.live-layers i.dashed { width: 34px; border-radius: 0; }
 .live-range { display: flex; align-items: center; gap: 8px; flex: 1 1 300px; color: var(--soft); }
 .live-range input { flex: 1 1 80px; min-width: 60px; accent-color: var(--accent); }
 .live-range output { min-width: 5em; font-variant-numeric: tabular-nums; }

@@ -27,10 +27,12 @@ from graphslam.results.drawing_elements import (
 )
 from graphslam.results.drawing_scales import Scale, linear_scale, log_scale
 from graphslam.results.folder import SavedResult
+from graphslam.results.live_figure import live_html
 from graphslam.results.live_map import live_map
+from graphslam.results.live_paths import _followed
 from graphslam.results.report import render
 from graphslam.results.report_figure import Drawing, density, map_axes
-from graphslam.results.report_maps import poses_at
+from graphslam.results.report_maps import poses_at, trajectory_map
 from graphslam.results.report_tables import headline, landmark_sigma, number
 
 
@@ -402,6 +404,60 @@ def test_the_headline_says_what_where_and_how_good(indoors, outdoors):
     assert sentence.startswith("From 13\u202f631 scans of one robot over ")
     assert "80 keyframes and 12 line landmarks" in sentence
     assert "2 robots" in headline(outdoors[0])
+
+
+@pytest.mark.parametrize("count", [1, 32])
+def test_paths_of_the_map_that_moves_cut_no_corners(count):
+    """An hour of drive, 18 000 poses with a corner every 8 m: lines that are drawn are within a
+    centimetre of every pose, of which every n-th misses them by decimetres. All robots have poses
+    for the replay, every 15 s at least."""
+    result, _, _ = orchard(keyframes=30, trees=9)
+    t = np.arange(18_000) * 0.2
+    turn = np.pi / 2 * (np.floor(t / 40) % 3)
+    at = np.cumsum(0.04 * np.column_stack([np.cos(turn), np.sin(turn), 0 * t]), axis=0)
+    stamps = result.robots["robot1"].final.stamps_ns[0] + np.round(t * 1e9).astype(np.int64)
+    path = Trajectory(stamps, at, np.tile(1e-4 * np.eye(3), (len(t), 1, 1)))
+    robot = result.robots["robot1"]
+    long = dataclasses.replace(robot, final=path, causal=path, dead_reckoning=path)
+    robots = {f"r{k:02}": long for k in range(count)}
+    figure = live_map(dataclasses.replace(result, robots=robots, steps=()))
+    drawn = [one.columns for one in figure.series if one.glyph == "path"]
+    assert len(drawn) == 3 * count
+    for columns in drawn:
+        assert np.diff(columns["time"]).max() < 15
+        at_time = np.searchsorted(columns["time"], t, side="right") - 1
+        line = np.minimum(at_time, len(columns["time"]) - 2)
+        ends = np.column_stack([columns["x"], columns["y"]])
+        along, offset = ends[line + 1] - ends[line], at[:, :2] - ends[line]
+        across = along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]
+        assert (np.abs(across) / np.hypot(*along.T)).max() <= 0.01
+
+
+def test_a_path_of_a_comparison_and_its_truth_cut_no_corners():
+    """In the same way, for the back ends of one log."""
+    t = np.arange(18_000) * 0.2
+    at = 0.01 * t[:, None] * np.column_stack([np.cos(t / 9), np.sin(t / 9)])
+    chosen = _followed(at, 1)
+    line = np.clip(np.searchsorted(chosen, np.arange(len(t)), side="right") - 1, 0, len(chosen) - 2)
+    begin, along = at[chosen[line]], at[chosen[line + 1]] - at[chosen[line]]
+    across = along[:, 0] * (at - begin)[:, 1] - along[:, 1] * (at - begin)[:, 0]
+    assert (np.abs(across) / np.hypot(*along.T)).max() <= 0.01 and len(chosen) <= 9000
+
+
+def test_a_name_in_the_legend_of_a_map_is_of_one_robot():
+    """By colour and dashes, of three dozen; in the map that moves and in the drawing."""
+    result, _, _ = orchard(keyframes=30, trees=9)
+    robots = {f"r{k:02}": result.robots["robot1"] for k in range(36)}
+    many = dataclasses.replace(result, robots=robots, steps=())
+    figure = live_map(many)
+    drawn = [one for one in figure.series if one.glyph == "path" and one.layer in robots]
+    looks = {(one.layer, one.color, str(one.dash)) for one in drawn}
+    assert len(looks) == len({look[1:] for look in looks}) == 36
+    samples = re.findall(r"<i class=[^>]*></i>(?=r\d\d<)", live_html(figure))
+    assert len(samples) == len(set(samples)) == 36
+    svg, _ = trajectory_map(many, 3.0)
+    samples = re.findall(r'<path d="M\d+ -?\d+h\d+" style="([^"]*)"', svg)
+    assert len(samples) == len(set(samples)) == 36
 
 
 def test_the_map_holds_the_whole_path_and_ellipses_that_are_apart():
