@@ -175,7 +175,8 @@ class KeyframeConfig:
 
     mode: `motion` = at an observation, once the robot has moved distance_m or turned angle_rad
     since its last state (scan_angle_rad for a scan, which overlaps more with the one before);
-    `all` = at every odometry, scan and sighting stamp.
+    `all` = at every odometry, scan and sighting stamp. A recorded relative pose is an observation
+    at both of its ends; in logs of these alone there are states at odometry between distant ends.
     sighting_window_s: in logs of several robots without scans, sightings within this span enter as
     one step, transported to its end by odometry.
     scans_between: how scans without a state follow from the states around them (back end batch):

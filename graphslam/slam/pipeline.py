@@ -301,11 +301,11 @@ class Pipeline(StepRecorder):
         self.record_time(time_ns)
         self.start_if_needed(first.robot)
         if isinstance(first, ODOMETRY) and self.config.keyframe.mode != "all":
+            self.add_closure_starts(first.robot, time_ns, self.keyframes)
             return  # most of a log; the track has it already
         left_out = isinstance(first, Scan) and run.repeats.leaves_out(first, run.track)
         if isinstance(first, Scan):  # an event of its own
-            event = undistorted_by_track([first], run.track)
-            first = event[0]
+            first, *_ = event = undistorted_by_track([first], run.track)
         run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
         self.counts["scans"] += isinstance(first, Scan)
         if left_out:

@@ -29,15 +29,24 @@ from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.estimation.replay import replay
 from graphslam.logs import LogSet
 from graphslam.odometry.given_increments import consecutive_motions
+from graphslam.odometry.preintegration import Track
+from graphslam.odometry.readings import IntArray
 from graphslam.slam.initialisation import estimate_start_poses
 from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
 from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.passes import Findings, FinishedPass, pass_findings
 from graphslam.slam.pipeline import Pipeline
-from graphslam.slam.recorded_closures import accept_closures, take_relative_poses
+from graphslam.slam.recorded_closures import (
+    accept_closures,
+    closure_id,
+    take_relative_poses,
+)
 from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.start_priors import start_poses
+
+#: keyframes' distances up to which poses between two states follow from these
+BRIDGED_KEYFRAMES = 10
 
 
 def is_pose_graph(log: LogSet, config: Config) -> bool:
@@ -97,6 +106,8 @@ def _make_steps(pipeline: Pipeline, messages: Iterable[RelativePose]) -> list[St
     ends: dict[str, set[int]] = defaultdict(set)
     for message in usable:
         ends[message.robot].add(message.time_ns)
+        if _has_start(message, pipeline):
+            ends[message.other].add(message.start_ns)
     starts: dict[int, dict[str, Start]] = defaultdict(dict)
     motions: dict[int, dict[str, Motion]] = defaultdict(dict)
     for robot, run in sorted(pipeline.runs.items()):
@@ -136,8 +147,24 @@ def _is_usable(message: RelativePose, pipeline: Pipeline) -> bool:
     return True
 
 
+def _has_start(message: RelativePose, pipeline: Pipeline) -> bool:
+    """Whether the state where a relative pose starts is one that odometry can give.
+
+    Without a state of its own the closure would begin at the last one before, carried there by
+    odometry that the motions between states have in them already.
+    """
+    other = pipeline.runs.get(message.other)
+    max_gap_ns = round(1e9 * pipeline.config.odometry.max_gap_s)
+    if closure_id(message) in pipeline.known.recorded.refused or other is None:
+        return False
+    return other.track.covers(message.start_ns, max_gap_ns)
+
+
 def _state_times(pipeline: Pipeline, run: RobotState, ends_ns: Sequence[int]) -> list[int]:
-    """Times of a robot's states: of every message, or of closures a keyframe's motion apart."""
+    """Times of a robot's states: of every message, or of closures a keyframe's motion apart.
+
+    And of readings in between, see `_readings_between`.
+    """
     first_ns = min([run.track.first_ns, *ends_ns[:1]])
     if pipeline.config.keyframe.mode == "all":
         return sorted({first_ns, *run.track.times.tolist(), *ends_ns})
@@ -145,7 +172,23 @@ def _state_times(pipeline: Pipeline, run: RobotState, ends_ns: Sequence[int]) ->
     for end_ns in ends_ns:
         if end_ns > times[-1] and pipeline.keyframes.has_moved(run, times[-1], end_ns):
             times.append(end_ns)
-    return times
+    between = _readings_between(run.track, np.array(times, dtype=np.int64), pipeline.config)
+    return sorted({*times, *between})
+
+
+def _readings_between(track: Track, times_ns: IntArray, config: Config) -> list[int]:
+    """Times of readings that get a state, so that no two states (n,) are far from each other.
+
+    What is reported between two states has their disagreement spread over the way, so the way must
+    be short: over two rounds of a circle of 40 m that is wrong by metres.
+    """
+    readings = track.times
+    readings = readings[(readings > times_ns[0]) & (readings < times_ns[-1])]
+    before = np.searchsorted(times_ns, readings, side="right") - 1
+    path_m = track.driven(readings)[:, 0] - track.driven(times_ns)[before, 0]
+    stretch = np.floor(path_m / (BRIDGED_KEYFRAMES * config.keyframe.distance_m))
+    _, first = np.unique(np.column_stack([before, stretch]), axis=0, return_index=True)
+    return [int(t) for t in readings[first[stretch[first] > 0]]]
 
 
 # ---------------------------------------------------------------- from steps to the estimate

@@ -1,6 +1,7 @@
 """Relative poses recorded in a log: which are used, and their conversion to closures."""
 
 from bisect import bisect_right
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -39,6 +40,13 @@ class RecordedClosures:
     frames: Mapping[str, str]
     kept: frozenset[ClosureId]
     refused: Mapping[ClosureId, str]
+
+    def start_times(self) -> dict[str, list[int]]:
+        """Robot -> sorted times at which the used ones start."""
+        times: dict[str, set[int]] = defaultdict(set)
+        for _, _, other, start_ns, _ in self.kept:
+            times[other].add(start_ns)
+        return {robot: sorted(found) for robot, found in times.items()}
 
     def to_summary(self) -> dict[str, Any]:
         """For summary.json: number ``kept``, list of those ``refused``, and why."""

@@ -1,6 +1,7 @@
 """Steps into the back end, and what is recorded of them: states, calibration, covariances."""
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from graphslam.estimation.compressed_filter import CompressedBackend
 from graphslam.logs import LogSet
 from graphslam.mapping.data_association import Associator
 from graphslam.odometry.online_calibration import observed_information
+from graphslam.slam.keyframes import KeyframeSelector
 from graphslam.slam.log_pass import LogPass, PriorKnowledge, timed
 
 #: the scans of one robot are solved as a whole after so many steps, and again whenever there are so
@@ -39,6 +41,9 @@ class StepRecorder(LogPass):
         # that is not told yet would move them. Sightings have passes of their own
         alone = len(log.robots) == 1 and log.has_scans(log.robots[0])
         wanted = batch_steps and alone and self.config.odometry.calibrate
+        starts = known.recorded.start_times()
+        # scans have states of their own nearby, each checked against the one before
+        self._closure_starts = {r: deque(t) for r, t in starts.items() if not log.has_scans(r)}
         self._next_batch_step = FIRST_BATCH_STEP if wanted else math.inf  # number of steps
 
     @property
@@ -74,6 +79,21 @@ class StepRecorder(LogPass):
         if robot in self.starts and len(run.track) and run.track.first_ns <= time_ns:
             self.start_if_needed(robot)
         return run.started
+
+    def add_closure_starts(self, robot: str, now_ns: int, keyframes: KeyframeSelector) -> None:
+        """Give a robot states where recorded closures start that will be used, up to now.
+
+        Without one a closure would be carried to the last state before by odometry that the motions
+        between states have in them already.
+        """
+        waiting, run = self._closure_starts.get(robot, deque()), self.runs[robot]
+        while waiting and waiting[0] <= now_ns:
+            start_ns = waiting.popleft()
+            motion = self.motion_since_state(robot, start_ns)
+            if motion is not None and keyframes.has_moved(run, run.state_ns, start_ns):
+                run.path_m += motion.length_m
+                self.record_covariances()
+                self.add_step(Step(start_ns, {}, {robot: motion}), set())
 
     def motion_since_state(self, robot: str, time_ns: int) -> Motion | None:
         """Motion since the robot's last state; None when it is at that very time."""

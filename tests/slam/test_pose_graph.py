@@ -9,7 +9,7 @@ from pose_checks import assert_same_pose
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
-from graphslam.core.geometry import between, compose
+from graphslam.core.geometry import between, compose, exp
 from graphslam.logs import LogWriter, open_logs
 from graphslam.slam import smooth as job
 from graphslam.slam.pose_graph import is_pose_graph
@@ -99,6 +99,75 @@ def test_at_once_is_the_same_as_step_by_step(settings, tmp_path, monkeypatch):
     assert [pair for pair, *_ in made] == [pair for pair, *_ in expected]
     deltas = [np.array([delta for _, *delta in found]) for found in (made, expected)]
     assert_same_pose(*deltas, atol=1e-9)
+
+
+#: motion of a robot (m, m, rad) in a second: a round in 40 s, 40 m long
+TWIST = np.array([1.0, 0.0, 2 * np.pi / 40])
+
+
+def write_rounds(path, robots=("a",), offset_s=0.0, seconds=160):
+    """Robots on a circle, each a second behind the next; the fourth round is seen from the first.
+
+    ``offset_s``: from readings to ends of closures, which are ten times as accurate as odometry.
+    """
+    rng, sigmas = np.random.default_rng(2), np.array([0.03, 0.03, 0.01])
+    begins = {robot: exp(n * TWIST) for n, robot in enumerate(robots)}
+    offset_ns = round(offset_s * S)
+
+    def at(robot, second):
+        return compose(begins[robot], exp(second * TWIST))
+
+    with LogWriter(path) as log:
+        for k in range(seconds):
+            for robot, other in zip(robots, robots[::-1], strict=True):
+                delta = exp(TWIST) + rng.normal(0, sigmas)
+                log.increment(robot, k * S, (k + 1) * S, delta=delta, cov=np.diag(sigmas**2))
+                if k < 120 or k % 4:
+                    continue
+                ends = k - 117 + offset_s, k + offset_s
+                delta = between(at(other, ends[0]), at(robot, ends[1]))
+                log.relative_pose(
+                    robot,
+                    (k - 117) * S + offset_ns,
+                    k * S + offset_ns,
+                    other=other,
+                    delta=delta + rng.normal(0, sigmas / 10),
+                    cov=np.diag(sigmas / 10) ** 2,
+                )
+    return path
+
+
+@pytest.mark.parametrize("robots", [("a",), ("a", "b")])
+@pytest.mark.parametrize("offset_s", [0.0, 0.4])
+def test_states_at_closures_are_enough(robots, offset_s, tmp_path):
+    """As logs are written, without saying where states are: closures begin and end at states, and
+    both paths and covariances are those with a state at every reading. A closure carried to the
+    state before its start, up to 118 m by odometry that the motions have too, moved the path by
+    metres."""
+    path = write_rounds(tmp_path / "log.mcap", robots, offset_s)
+    found, full = (
+        run(path, load_config(overrides=settings)) for settings in ((), ("keyframe.mode=all",))
+    )
+    assert found.summary["counts"]["keyframes"] < 0.6 * full.summary["counts"]["keyframes"]
+    assert found.summary["counts"]["loop_closures"] == 10 * len(robots)
+    for robot in robots:
+        ours, theirs = found.robots[robot].final, full.robots[robot].final
+        np.testing.assert_array_equal(ours.stamps_ns, theirs.stamps_ns)
+        # between states poses are interpolated over 3 m at most, where odometry is good to 5 cm
+        assert_same_pose(ours.poses, theirs.poses, atol=0.05)
+        sigmas = np.sqrt(np.diagonal(ours.covs, axis1=1, axis2=2)[1:])
+        expected = np.sqrt(np.diagonal(theirs.covs, axis1=1, axis2=2)[1:])
+        np.testing.assert_allclose(sigmas, expected, rtol=0.15, atol=0.01)
+
+
+def test_states_at_the_starts_of_closures_step_by_step(tmp_path, monkeypatch):
+    """The same log taken in step by step, as a filter and a finite horizon do: a state at each
+    start, so that no closure is less certain than it was written."""
+    path = write_rounds(tmp_path / "log.mcap")
+    result = run(path, Config(), monkeypatch)
+    covs = [c.cov for step in result.steps for c in step.closures]
+    assert len(covs) == 10
+    np.testing.assert_allclose(covs, [np.diag([0.003, 0.003, 0.001]) ** 2] * 10, rtol=1e-6)
 
 
 def test_odometry_that_is_noisier_than_it_states_is_used_as_stated_and_warned_of(tmp_path):
