@@ -13,6 +13,7 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Closure, Estimate, Step
 from graphslam.estimation import factors
+from graphslam.estimation.information_root import information_root, pair_covariances
 from graphslam.estimation.isam2 import BatchGraph, with_means
 from graphslam.estimation.optimisation import (
     CONVERGED_ERROR_ROUGH,
@@ -54,6 +55,7 @@ class ClosureGraph:
         self._kernel, self._rows = kernel, self._builder.rows
         groups = self._builder.closure_groups(replace(c, verified=True) for c in closures)
         self._plain = [factor for group in groups for factor in group.factors]
+        self._used: tuple[int, ...] = ()
         self._ends: list[tuple[int, int]] = []
         self._robust: list[gtsam.NonlinearFactor] = []
         for factor in self._plain:
@@ -83,8 +85,9 @@ class ClosureGraph:
             EstimationError: the graph is indeterminate.
         """
         self._graph.resize(self._size)
+        self._used = tuple(used)
         made = self._robust if robust else self._plain
-        chosen = [made[k] for k in used]
+        chosen = [made[k] for k in self._used]
         for factor in chosen:
             self._graph.add(factor)
         self._builder.rows = self._rows + 3 * len(chosen)
@@ -105,12 +108,11 @@ class ClosureGraph:
         Raises:
             EstimationError: the graph is indeterminate.
         """
-        joint = self._covariances(self._ends).joint
         x, y = (
             np.array([factors.read(self._values, pair[end], 3) for pair in self._ends])
             for end in (0, 1)
         )
-        return x, y, np.array([joint[pair] for pair in self._ends])
+        return x, y, self._joint()
 
     def estimate(self) -> Estimate:
         """The solution with its covariances.
@@ -122,8 +124,33 @@ class ClosureGraph:
         means = with_means(self._values, builder.dims(), self._covariances().marginals)
         return builder.estimate(means, float(self._graph.error(self._values)))
 
-    def _covariances(self, pairs: Sequence[tuple[int, int]] = ()) -> CovarianceBlocks:
+    def _joint(self) -> Array:
+        """Joint covariances (n, 6, 6) of the ends of every candidate.
+
+        Those in the solution are in its root. False ones tie poses far from each other, so if they
+        were made part of it they would fill it: the time would grow with the cube of their number.
+        """
+        inside = {self._ends[k] for k in self._used}
+        apart = sorted(set(self._ends) - inside)
+        blocks = self._covariances(sorted(inside), keep_rows=bool(apart))
+        joint = dict(blocks.joint)
+        if apart:
+            assert blocks.rows is not None
+            keys, numbers = np.unique(apart, return_inverse=True)
+            root = information_root(blocks.rows, {"": keys.tolist()}, {})
+            rows, maps = root.states[""][:, None], np.broadcast_to(np.eye(3), (len(keys), 1, 3, 3))
+            pairs = numbers.reshape(-1, 2)
+            own, cross = pair_covariances(root, rows, maps, pairs)
+            for pair, (a, b), between in zip(apart, pairs, cross, strict=True):
+                joint[pair] = np.block([[own[a], between], [between.T, own[b]]])
+        return np.array([joint[pair] for pair in self._ends])
+
+    def _covariances(
+        self, pairs: Sequence[tuple[int, int]] = (), *, keep_rows: bool = False
+    ) -> CovarianceBlocks:
         try:
-            return marginals_of(self._graph, self._values, pairs, use_qr=self._use_qr)
+            return marginals_of(
+                self._graph, self._values, pairs, keep_rows=keep_rows, use_qr=self._use_qr
+            )
         except RuntimeError as error:
             raise self._builder.explain(error) from error

@@ -17,7 +17,6 @@ Recorded closures may be outliers, so none is accepted by itself.
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +35,9 @@ from graphslam.core.records import (
 )
 from graphslam.estimation.closure_graph import ClosureGraph
 from graphslam.estimation.initial_estimate import initial_estimate
-from graphslam.odometry.given_increments import consecutive_motions
+from graphslam.mapping.recorded_loops import OdometryChain, compared_loops, odometry_chains
 from graphslam.odometry.preintegration import Track
 
-#: probability up to which two closures agree; against all others together it is
-#: `FIT_PROBABILITY`, so that true closures are rarely lost (false ones miss by far more)
-AGREE = 0.99
 #: closures compared with each other at once, in order of time; the work grows with its square
 CHUNK = 1000
 #: closures from which the largest consistent set is searched for; what it lacks is added later
@@ -56,10 +52,6 @@ MISFIT_SHARE = 0.01
 MAX_ROUNDS = 30
 #: prior covariance (m, rad) of the origin of a robot's own frame
 ORIGIN = np.diag([1e-3, 1e-3, 1e-3]) ** 2
-
-_UPPER = np.triu_indices(3)
-#: the unit matrix by its upper triangle; precision of sums of covariances
-UNIT, ROUNDING = np.eye(3)[_UPPER], 1e-15
 
 CONTRADICTED = "it contradicts the others"
 UNSUPPORTED = "no other closure supports it"
@@ -102,7 +94,7 @@ def verify(
     judged = [k for k, m in enumerate(messages) if _has_ends(m, tracks)]
     if not judged:
         return NOTHING_RECORDED
-    odometry = _odometry([messages[k] for k in judged], tracks)
+    odometry = odometry_chains([messages[k] for k in judged], tracks)
     groups: dict[tuple[str, str], list[int]] = defaultdict(list)
     for k in judged:
         groups[messages[k].other, messages[k].robot].append(k)
@@ -113,7 +105,7 @@ def verify(
         numbers.sort(key=lambda k: messages[k].time_ns)
         for part in range(0, len(numbers), CHUNK):
             chunk = numbers[part : part + CHUNK]
-            E, agree = _loops([messages[k] for k in chunk], odometry)
+            E, agree = compared_loops([messages[k] for k in chunk], odometry)
             frames_seen.update(zip(chunk, E, strict=True))
             worth = np.ones(len(chunk), dtype=np.float32)
             best = greedy_max_clique(agree, worth, SEARCH_STARTS)
@@ -135,6 +127,7 @@ def verify(
         [messages[k] for k in candidates],
         {n for n, k in enumerate(candidates) if k in believed},
         odometry,
+        tracks,
         {**placed, **starts},
     )
     kept = frozenset(candidates[n] for n in supported)
@@ -159,115 +152,6 @@ def _has_ends(m: RelativePose, tracks: Mapping[str, Track]) -> bool:
     )
 
 
-# ---------------------------------------------------------------- odometry
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _OdometryChain:
-    """A robot's odometry at the ends of closures: times (n,), poses (n, 3) from its first reading.
-
-    ``spread`` (n, 3, 3) is the covariance of the odometry up to there, in the left tangent space of
-    SE(2) at the first pose, so that the covariance of a stretch is the difference of its ends'.
-    """
-
-    times_ns: np.ndarray[tuple[int], np.dtype[np.int64]]
-    poses: Array
-    spread: Array
-    motions: tuple[Motion, ...]
-
-    def at(self, times_ns: Iterable[int]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """Indices (k,) of times in the chain."""
-        return np.searchsorted(self.times_ns, np.array(list(times_ns), dtype=np.int64))
-
-
-def _odometry(
-    messages: Iterable[RelativePose], tracks: Mapping[str, Track]
-) -> dict[str, _OdometryChain]:
-    """Robot -> its odometry between the ends of closures, beginning with its first reading."""
-    times: dict[str, set[int]] = defaultdict(set)
-    for m in messages:
-        times[m.robot] |= {tracks[m.robot].first_ns, m.time_ns}
-        times[m.other] |= {tracks[m.other].first_ns, m.start_ns}
-    chains = {}
-    for robot, needed in sorted(times.items()):
-        at = np.array(sorted(needed), dtype=np.int64)
-        moved = consecutive_motions(tracks[robot], at)
-        poses = np.zeros((len(at), 3))
-        for k, delta in enumerate(moved.delta):
-            poses[k + 1] = compose(poses[k], delta)
-        A = adjoint(poses[1:])
-        steps = A @ rotate_cov(moved.cov, -moved.delta[:, 2]) @ A.mT
-        spread = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
-        motions = tuple(moved.one(k, int(a), int(b)) for k, (a, b) in enumerate(pairwise(at)))
-        chains[robot] = _OdometryChain(at, poses, spread, motions)
-    return chains
-
-
-# ---------------------------------------------------------------- pairs
-
-
-def _loops(
-    messages: Sequence[RelativePose], odometry: Mapping[str, _OdometryChain]
-) -> tuple[Array, Array]:
-    """Closures between the same two robots, compared in pairs.
-
-    Closure a sees the first pose of its robot's odometry at E_a in the frame of the other's. The
-    loop of two is E_a E_b⁻¹; its errors are those of both closures and of the odometry between
-    their ends, all in the tangent space at the first pose of the other robot.
-
-    Returns:
-        E (n, 3), and which agree (n, n) bool.
-    """
-    other, own = odometry[messages[0].other], odometry[messages[0].robot]
-    i, j = other.at(m.start_ns for m in messages), own.at(m.time_ns for m in messages)
-    z = np.array([m.delta for m in messages])
-    seen = compose(other.poses[i], z)
-    back = inverse(own.poses[j])
-    E = compose(seen, back)
-    R = rotate_cov(np.array([m.cov for m in messages]), -z[:, 2])
-    at_other, at_own = adjoint(seen), adjoint(inverse(back))
-    R_other, R_own = at_other @ R @ at_other.mT, at_own @ R @ at_own.mT
-    A = _congruence(adjoint(E))
-    # symmetric matrices by their upper triangles, so that taking them from frame to frame is linear
-    there, here, R_other, R_own = (
-        M[:, *_UPPER] for M in (other.spread[i], own.spread[j], R_other, R_own)
-    )
-    # differences of the sums along the path are not more accurate than this
-    rounding = ROUNDING * max(np.abs(there).max(), np.abs(here).max()) * UNIT
-    gate = chi2_quantile(AGREE, 3)
-    agree = np.zeros((len(z), len(z)), dtype=bool)
-    first = inverse(E)
-    for a in range(len(z)):  # row by row: a matrix of 3 x 3 blocks would not fit
-        r = log(compose(E[a], first))
-        S = rounding + R_other[a] + np.sign(i - i[a])[:, None] * (there - there[a])
-        S += (np.sign(j - j[a])[:, None] * (here - here[a]) + R_own) @ A[a].T
-        agree[a] = _squared_distances(r, S) <= gate
-    agree &= agree.T
-    np.fill_diagonal(agree, False)
-    return E, agree
-
-
-def _congruence(A: Array) -> Array:
-    """Matrices (n, 6, 6) that take the upper triangle of M to that of A M Aᵀ, for A (n, 3, 3)."""
-    i, j = _UPPER
-    out = A[:, i[:, None], i] * A[:, j[:, None], j]
-    swapped = A[:, i[:, None], j] * A[:, j[:, None], i]
-    return np.asarray(out + np.where(i == j, 0.0, swapped))
-
-
-def _squared_distances(r: Array, S: Array) -> Array:
-    """Squared Mahalanobis distances (n,) of r (n, 3) for covariances by upper triangle (n, 6).
-
-    The square root is written out: NumPy's solution of small systems takes ten times as long.
-    """
-    (x, y, turn), (xx, xy, xt, yy, yt, tt) = r.T, S.T
-    a, b = xy / xx, xt / xx
-    y, yy, yt = y - a * x, yy - a * xy, yt - a * xt
-    c = yt / yy
-    turn, tt = turn - b * x - c * y, tt - b * xt - c * yt
-    return np.asarray(x * x / xx + y * y / yy + turn * turn / tt)
-
-
 # ---------------------------------------------------------------- frames
 
 
@@ -275,7 +159,7 @@ def _initial_starts(
     sets: Mapping[tuple[str, str], Sequence[int]],
     clear: set[tuple[str, str]],
     seen: Mapping[int, Array],
-    odometry: Mapping[str, _OdometryChain],
+    odometry: Mapping[str, OdometryChain],
     starts: Mapping[str, Start],
 ) -> tuple[dict[str, Start], dict[str, str]]:
     """Initial start poses of robots that have none, and the frame of each robot.
@@ -313,7 +197,8 @@ def _initial_starts(
 def _settle(
     messages: Sequence[RelativePose],
     believed: set[int],
-    odometry: Mapping[str, _OdometryChain],
+    odometry: Mapping[str, OdometryChain],
+    tracks: Mapping[str, Track],
     starts: Mapping[str, Start],
 ) -> tuple[set[int], ClosureGraph]:
     """The closures that support each other, beginning with ``believed``; and the graph of all.
@@ -321,22 +206,21 @@ def _settle(
     Its states are those at the ends of closures.
     """
     gate = chi2_quantile(FIT_PROBABILITY, 3)
-    closures = [Closure(m.robot, m.time_ns, m.other, m.start_ns, m.delta, m.cov) for m in messages]
-    steps = _steps(odometry, starts)
-    graph = ClosureGraph(
-        steps,
-        initial_estimate(steps, closures),
-        closures,
-        RobustConfig("geman-mcclure", KERNEL_SIGMAS),
-    )
-    misfits = _misfits_of_all(graph, closures)
-    if not misfits:
-        return set(range(len(closures))), graph
-    if misfits <= 1 + MISFIT_SHARE * len(closures):
-        believed = set(range(len(closures)))
-    else:
-        graph.begin_at(initial_estimate(steps, [closures[k] for k in sorted(believed)]))
+    steps, closures = _steps(odometry, starts), _closures(messages)
+    first = [closures[k] for k in sorted(believed)]
+    if _has_false_parts(messages, believed, tracks, starts):
+        graph = _graph(steps, closures, first)
         graph.solve(sorted(believed), robust=False)
+    else:
+        graph = _graph(steps, closures, closures)
+        misfits = _misfits_of_all(graph, closures)
+        if not misfits:
+            return set(range(len(closures))), graph
+        if misfits <= _tolerated(len(closures)):
+            believed = set(range(len(closures)))
+        else:
+            graph.begin_at(initial_estimate(steps, first))
+            graph.solve(sorted(believed), robust=False)
     barred: set[int] = set()
     for _ in range(MAX_ROUNDS):
         graph.solve(sorted(believed), robust=True)
@@ -353,6 +237,52 @@ def _settle(
     return believed, graph
 
 
+def _has_false_parts(
+    messages: Sequence[RelativePose],
+    believed: set[int],
+    tracks: Mapping[str, Track],
+    starts: Mapping[str, Start],
+) -> bool:
+    """Whether parts of many closures have as many misfits as all together may not have.
+
+    False ones tie poses far from each other, so the time to solve all together grows with the cube
+    of their number. Those among a thousand are as false with the others: the parts of which the
+    fewest are ``believed`` come first, until one has hardly any.
+    """
+    if len(messages) <= CHUNK:
+        return False
+    parts = [
+        range(len(messages))[first : first + CHUNK] for first in range(0, len(messages), CHUNK)
+    ]
+    misfits = 0
+    for part in sorted(parts, key=lambda part: len(believed & set(part)) / len(part)):
+        some = [messages[k] for k in part]
+        closures = _closures(some)
+        graph = _graph(_steps(odometry_chains(some, tracks), starts), closures, closures)
+        found = _misfits_of_all(graph, closures)
+        misfits += found
+        if misfits > _tolerated(len(messages)) or found <= _tolerated(len(part)):
+            break
+    return misfits > _tolerated(len(messages))
+
+
+def _tolerated(closures: int) -> float:
+    """How many of closures may not fit with all others although all are true."""
+    return 1 + MISFIT_SHARE * closures
+
+
+def _closures(messages: Iterable[RelativePose]) -> list[Closure]:
+    return [Closure(m.robot, m.time_ns, m.other, m.start_ns, m.delta, m.cov) for m in messages]
+
+
+def _graph(
+    steps: Sequence[Step], closures: Sequence[Closure], followed: Sequence[Closure]
+) -> ClosureGraph:
+    """A graph of closures that begins where odometry and those ``followed`` lead."""
+    kernel = RobustConfig("geman-mcclure", KERNEL_SIGMAS)
+    return ClosureGraph(steps, initial_estimate(steps, followed), closures, kernel)
+
+
 def _misfits_of_all(graph: ClosureGraph, closures: Sequence[Closure]) -> int:
     """How many closures do not fit when all are solved together, without a kernel.
 
@@ -366,7 +296,7 @@ def _misfits_of_all(graph: ClosureGraph, closures: Sequence[Closure]) -> int:
     return int(np.count_nonzero(d2 > chi2_quantile(FIT_PROBABILITY, 3)))
 
 
-def _steps(odometry: Mapping[str, _OdometryChain], starts: Mapping[str, Start]) -> list[Step]:
+def _steps(odometry: Mapping[str, OdometryChain], starts: Mapping[str, Start]) -> list[Step]:
     """Starts and motions of all robots, in the order of time."""
     first: dict[int, dict[str, Start]] = defaultdict(dict)
     motions: dict[int, dict[str, Motion]] = defaultdict(dict)

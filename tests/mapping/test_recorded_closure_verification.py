@@ -9,7 +9,9 @@ from common import pose_graph_values
 
 from graphslam.core.config import BackendConfig, Config, StartConfig
 from graphslam.core.geometry import between, compose
+from graphslam.estimation.closure_graph import ClosureGraph
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
+from graphslam.mapping import recorded_closure_verification
 from graphslam.mapping.recorded_closure_verification import CONTRADICTED
 from graphslam.slam.smooth import smooth
 
@@ -160,3 +162,24 @@ def test_two_stories_of_the_same_size_place_nobody(seed, tmp_path):
     assert any("separate frame" in warning for warning in result.summary["warnings"])
     assert ends(graph.false) | ends(between_robots[:9]) <= refused(result)
     np.testing.assert_allclose(result.robots["robot2"].final.poses[0], 0.0, atol=1e-3)
+
+
+def test_many_closures_of_which_many_are_false_are_not_solved_together(tmp_path, monkeypatch):
+    """Every third of 450 is false. Breaks if all are solved at once, which takes time with the cube
+    of the number of false ones; and if what is refused is not what is false."""
+    monkeypatch.setattr(recorded_closure_verification, "CHUNK", 150)
+    solved, solve = [], ClosureGraph.solve
+
+    def noted(graph, used, **options):
+        solved.append(len(used))
+        solve(graph, used, **options)
+
+    monkeypatch.setattr(ClosureGraph, "solve", noted)
+    graph = two_robots(1, random=150)
+    rng = np.random.default_rng(6)
+    for a, b, delta in graph.true * 4:
+        graph.true.append((a, b, compose(delta, CLOSURE * rng.normal(size=3))))
+    result = smoothed(graph, tmp_path)
+    assert refused(result) >= ends(graph.false)
+    assert result.summary["closures"]["kept"] > 0.95 * len(graph.true)
+    assert max(solved) < len(graph.true) + 1
