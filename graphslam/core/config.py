@@ -64,7 +64,8 @@ class AssociationConfig:
     observed again within this time and path is deleted. delete_s: one in the graph that is not
     observed for this long is not associated again, and a filter deletes it (section 4.6).
     reacquire_m: a landmark not observed for this much path counts as old; old lines are matched
-    again only if reacquire_min of them, not all parallel, agree. reassociation_gate_m (across),
+    again only if reacquire_min of them, not all parallel, agree, or if the estimate knows to 0.1 m
+    and 0.05 rad (sigma) where the robot should see it. reassociation_gate_m (across),
     reassociation_gate_rad: largest residual of an observation when the solved log is associated
     again, and distance of one landmark's visits.
     """

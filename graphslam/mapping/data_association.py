@@ -22,7 +22,6 @@ from graphslam.mapping.gating import (
     BoolArray,
     PairDistances,
     Pairs,
-    assign,
     candidate_pairs,
     compare,
     fixes_pose,
@@ -32,6 +31,7 @@ from graphslam.mapping.gating import (
     jointly_compatible,
 )
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
+from graphslam.mapping.pair_selection import assign_pairs, known_alone, worth_comparing
 from graphslam.mapping.robot_candidates import (
     NOT_THERE,
     RobotTarget,
@@ -43,9 +43,6 @@ from graphslam.odometry.preintegration import Track
 
 #: images between two refreshes of all landmark estimates; those compared are always current
 REFRESH_EVERY = 50
-#: landmarks per observation whose joint marginal is read, the nearest by crude distance: recently
-#: seen ones, and old ones (more, as the pose may have drifted)
-NEAREST_RECENT, NEAREST_OLD = 3, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +186,8 @@ class Associator:
         entries = [self.map.entries[int(ids[j])] for j in pairs.landmark]
         last_m = np.array([e.path_m.get(image.robot, -np.inf) for e in entries])
         recent = image.path_m - last_m <= self._config.reacquire_m
-        keep = _worth_comparing(pairs, entries, recent, self._config.reacquire_min)
-        pairs, recent = pairs.only(keep), recent[keep]
+        keep = worth_comparing(pairs, entries, recent, self._config.reacquire_min)
+        pairs, recent, seen_before = pairs.only(keep), recent[keep], np.isfinite(last_m[keep])
         entries = [e for e, k in zip(entries, keep, strict=True) if k]
         # observations with an identity bring their pair along, ungated
         known = [
@@ -216,6 +213,10 @@ class Associator:
             image.robots,
         )
         compared = self._compare(image, pairs, entries, joint, where)
+        # named ones are recent
+        mine = np.append(seen_before, np.zeros(len(known), dtype=bool))
+        mine &= np.array([e.id in where for e in entries], dtype=bool)
+        recent |= mine & known_alone(pairs, compared)
         of_robots = robot_distances(seen, image.robots, joint, self._floor)
         return Candidates(joint, where, pairs, compared, recent, tuple(entries), *of_robots)
 
@@ -278,7 +279,7 @@ class Associator:
 
         def best(which: BoolArray, *, robots: bool = False) -> dict[int, int]:
             use = np.append(which, np.full(len(d2) - len(which), robots))
-            return _assign_pairs(every, d2, gate, use, len(image.seen), config)
+            return assign_pairs(every, d2, gate, use, len(image.seen), config)
 
         # observations of one image exclude each other: landmarks with an identity are taken
         free = ~known & ~np.isin(pairs.landmark, pairs.landmark[known])
@@ -392,59 +393,3 @@ class Associator:
             entry.kind = "line"
         waiting, entry.evidence = entry.evidence, []
         return [replace(e, model=entry.kind, late=e.time_ns != seen.time_ns) for e in waiting]
-
-
-def _worth_comparing(
-    pairs: Pairs, entries: Sequence[Entry], recent: BoolArray, reacquire_min: int
-) -> BoolArray:
-    """Pairs (k,) that are compared by the joint marginal, which is expensive to read.
-
-    All pairs with tentative landmarks, which need none; of the graph's landmarks the few nearest
-    per observation; old ones only if enough observations have some to close a loop.
-    """
-    in_graph = np.array([e.in_graph for e in entries], dtype=bool)
-    keep = ~in_graph
-    old = in_graph & ~recent
-    if len(set(pairs.observation[old].tolist())) < reacquire_min:
-        old = np.zeros_like(old)
-    for group, limit in ((in_graph & recent, NEAREST_RECENT), (old, NEAREST_OLD)):
-        members = np.flatnonzero(group)
-        members = members[np.lexsort((pairs.rough_distance[members], pairs.observation[members]))]
-        rank = np.arange(len(members)) - np.searchsorted(
-            pairs.observation[members], pairs.observation[members]
-        )
-        keep[members[rank < limit]] = True
-    return keep
-
-
-def _assign_pairs(
-    pairs: Pairs,
-    d2: Array,
-    gate: Array,
-    which: BoolArray,
-    n: int,
-    config: AssociationConfig,
-) -> dict[int, int]:
-    """Observation -> pair among the pairs ``which``.
-
-    One-to-one first. A line may be seen in several parts (a pillar hides its middle), so a line
-    observation left over joins its nearest landmark even if that has an observation already.
-    """
-    use = np.flatnonzero(which & (d2 < gate))
-    if not len(use):
-        return {}
-    columns = {int(j): c for c, j in enumerate(np.unique(pairs.landmark[use]))}
-    cost = np.full((n, len(columns)), np.inf)
-    limit = np.zeros_like(cost)
-    number = np.full(cost.shape, -1, dtype=np.int64)
-    for k in use:
-        cell = int(pairs.observation[k]), columns[int(pairs.landmark[k])]
-        cost[cell], limit[cell], number[cell] = d2[k], gate[k], k
-    chosen = {i: int(number[i, c]) for i, c in assign(cost, limit, config.method)}
-    if config.nearness == "middle":
-        return chosen  # what shares no middle is no part of it
-    for k in use[np.argsort(d2[use], kind="stable")]:
-        i = int(pairs.observation[k])
-        if i not in chosen and pairs.model[k] == "line":
-            chosen[i] = int(k)
-    return chosen

@@ -73,12 +73,13 @@ class Pairs:
 class PairDistances:
     """Squared Mahalanobis distances (k,) of pairs, with what a joint test needs.
 
-    ``residuals``, ``H_x`` and ``H_t`` hold one array per pair.
+    ``residuals``, their covariances ``cov``, ``H_x`` and ``H_t`` hold one array per pair.
     """
 
     d2: Array
     dof: IntArray
     residuals: tuple[Array, ...]
+    cov: tuple[Array, ...]
     H_x: tuple[Array, ...]
     H_t: tuple[Array, ...]
     noise: tuple[Array, ...]
@@ -222,6 +223,7 @@ def compare(
     H_xs: list[Array] = [np.zeros((0, 3))] * k
     H_ts: list[Array] = [np.zeros((0, 3))] * k
     noises: list[Array] = [np.zeros((0, 0))] * k
+    covs: list[Array] = [np.zeros((0, 0))] * k
     both = zip(pairs.observation, pairs.flipped, strict=True)
     oriented = [flip(seen[i]) if flipped else seen[i] for i, flipped in both]
     for name in sorted(set(pairs.model)):
@@ -240,9 +242,11 @@ def compare(
         d2[which] = mahalanobis_squared(r, S)
         dof[which] = model.rows
         for place, n in enumerate(which):
-            residuals[n], noises[n] = r[place], R[place]
+            residuals[n], covs[n], noises[n] = r[place], S[place], R[place]
             H_xs[n], H_ts[n] = H_x[place], H_t[place]
-    return PairDistances(d2, dof, tuple(residuals), tuple(H_xs), tuple(H_ts), tuple(noises))
+    return PairDistances(
+        d2, dof, tuple(residuals), tuple(covs), tuple(H_xs), tuple(H_ts), tuple(noises)
+    )
 
 
 def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
