@@ -25,7 +25,7 @@ def worth_comparing(
     """Pairs (k,) that are compared by the joint marginal, which is expensive to read.
 
     All pairs with tentative landmarks, which need none; of the graph's landmarks the few nearest
-    per observation; old ones only if enough observations have some to close a loop.
+    per observation; old ones only if enough observations have some to close a loop, else a few walls.
     """
     in_graph = np.array([e.in_graph for e in entries], dtype=bool)
     keep = ~in_graph
@@ -52,7 +52,7 @@ def assign_pairs(
     n: int,
     config: AssociationConfig,
 ) -> dict[int, int]:
-    """Observation -> pair among the pairs ``which``.
+    """Observation -> pair among the pairs ``which`` (k,), by distances and gates (k,).
 
     One-to-one first. A line may be seen in several parts (a pillar hides its middle), so a line
     observation left over joins its nearest landmark even if that has an observation already.
