@@ -25,7 +25,7 @@ def worth_comparing(
     """Pairs (k,) that are compared by the joint marginal, which is expensive to read.
 
     All pairs with tentative landmarks, which need none; of the graph's landmarks the few nearest
-    per observation; old ones only if enough observations have some to close a loop, else a few walls.
+    per observation; old ones if enough observations have some to close a loop, else a few walls.
     """
     in_graph = np.array([e.in_graph for e in entries], dtype=bool)
     keep = ~in_graph
