@@ -100,6 +100,7 @@ class LandmarkMap:
         self.known_pairs: set[frozenset[int]] = set()
         self.by_identity: dict[str, int] = {}
         self.deleted = self.forgotten = 0  # tentative ones, and landmarks of the graph
+        self._unseen: dict[int, Entry] = {}
         self._next = 0
 
     def __len__(self) -> int:
@@ -250,9 +251,15 @@ class LandmarkMap:
     def expire_unseen(self, time_ns: int, age_ns: float) -> list[int]:
         """Delete landmarks of the graph that no robot has seen for long; returns their numbers."""
         gone = [i for i, e in self.entries.items() if e.in_graph and time_ns - e.last_ns > age_ns]
+        self._unseen |= {i: replace(self.entries[i], identity=None) for i in gone}
         self._delete(gone)
         self.forgotten += len(gone)
         return gone
+
+    def bring_back(self) -> None:
+        """Have those again that `expire_unseen` deleted, without names: a smoother knows them."""
+        self.entries |= self._unseen
+        self._unseen = {}
 
     def _delete(self, gone: Sequence[int]) -> None:
         for i in gone:

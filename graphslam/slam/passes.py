@@ -163,6 +163,7 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
     robots = RobotOffers(pipeline.offers, pipeline.sources or pipeline.robot_sightings)
     unused = robots.unused(pipeline.steps)
     pipeline.steps = list(robots.associated_again(pipeline.steps, estimate, config.robust, config))
+    pipeline.landmarks.bring_back()
     if is_sighting_log(pipeline):
         estimate, steps = solve_unnamed(pipeline, estimate)
     else:

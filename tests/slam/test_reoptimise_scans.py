@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import graphslam
 from graphslam.core.config import Config, OdometryConfig, RobotConfig
 from graphslam.core.geometry import between, compose, inverse
 from graphslam.core.records import Association, Closure, Motion, OdometryPose, Start, Step
@@ -12,6 +13,7 @@ from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.mapping.loop_closure import residuals, violated
 from graphslam.odometry.interpolation import origin_shift
 from graphslam.odometry.preintegration import Track
+from graphslam.simulation import load_scenario, simulate
 from graphslam.slam.reoptimise_scans import (
     Solver,
     _tightened,
@@ -151,3 +153,17 @@ def test_bases_begin_where_they_were_told_wherever_their_sensors_sit(mounts):
 def test_starts_that_were_found_stay_as_they_are():
     steps = starting(None)
     assert with_sensor_starts(steps, tracks_mounted_at(), {"a": "a", "b": "a"}) == tuple(steps)
+
+
+def test_what_was_not_seen_for_long_is_in_the_final_map_again(tmp_path):
+    """A filter forgets it, a smoother does not: lab walls that were deleted after 5 s out of sight
+    are in the final solution (it ended in a KeyError)."""
+    log = tmp_path / "lab.mcap"
+    simulate(load_scenario("lab"), log, 3)
+    found = {
+        age: graphslam.smooth(log, **{"backend.name": "isam2", "association.delete_s": age})
+        for age in (5.0, float("inf"))
+    }
+    assert found[5.0].summary["dropped"]["landmark: not seen again for association.delete_s"] > 5
+    # a wall more or less: those that come back are associated anew, in another order
+    assert abs(len(found[5.0].landmarks) - len(found[float("inf")].landmarks)) <= 2
