@@ -32,8 +32,6 @@ _FEWEST, _TURNS = 10, 24
 _GATES_M = (0.5, 0.5, 0.4, 0.3, 0.2, 0.2, 0.1, 0.1, 0.1, 0.06, 0.06)
 #: m per unit of difference between normals: sides that face apart are far apart; their least cosine
 _NORMAL_M, _FACING = 0.3, 0.7
-#: a box that was seen from another side looks like one that was turned by more than this
-_LARGEST_TURN_RAD = np.radians(60.0)
 #: least eigenvalue of the information: no direction known worse than to 0.1 m, rad
 _LEAST_INFORMATION = 1e2
 
@@ -57,7 +55,7 @@ def motion_between(a: Shape, b: Shape, known: MotionSettings) -> tuple[float, Di
     if any(straight):
         return None
     fits = [_icp(a, b, float(turn), known) for turn in np.arange(_TURNS) * 2 * np.pi / _TURNS]
-    found = [fit for fit in fits if fit is not None and abs(fit[1].motion[2]) < _LARGEST_TURN_RAD]
+    found = [fit for fit in fits if fit is not None and fit[1].is_plausible]
     if not found:
         return None
     best = max(fit[0] for fit in found)

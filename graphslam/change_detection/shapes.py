@@ -10,7 +10,7 @@ from graphslam.change_detection.grid import row_sums
 from graphslam.change_detection.regions import connected_components
 from graphslam.change_detection.surface_map import Surface
 from graphslam.change_detection.visit import Ints, Visit
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, wrap
 
 #: pieces of surface with a score below this, in sigmas, did not change
 UNCHANGED_SIGMAS = 2.0
@@ -23,6 +23,8 @@ PIECES_PER_WINDOW = 5.0
 _MIN_VAR = 1e-8
 #: variance of the normals below which a shape is straight
 _STRAIGHT = 0.05
+#: a thing that was seen from another side looks like one that was turned by more than this
+_LARGEST_TURN_RAD = np.radians(60.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +33,15 @@ class Displacement:
 
     motion: Array
     cov: Array
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether it turns the object by so little that both visits saw the same side of it.
+
+        By more, most likely the object did not turn and another side of it was seen, whose place
+        says nothing of the motion.
+        """
+        return bool(abs(wrap(self.motion[2])) < _LARGEST_TURN_RAD)
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,12 +114,15 @@ def motion_between_segments(
 def straight_motion(
     a: Shape, b: Shape, settings: MotionSettings
 ) -> tuple[float, Displacement] | None:
-    """Similarity 0..1 of two straight shapes and the motion; None if their lengths differ."""
+    """Similarity 0..1 of two straight shapes and the motion.
+
+    None if their lengths differ, or different faces of a thing were seen.
+    """
     one, other = fit_wall_segment(a, settings.cell_m), fit_wall_segment(b, settings.cell_m)
-    if not _same_length(one, other):
+    motion = motion_between_segments(one, other, settings)
+    if not _same_length(one, other) or not motion.is_plausible:
         return None
-    share = min(one.length, other.length) / max(one.length, other.length)
-    return share, motion_between_segments(one, other, settings)
+    return min(one.length, other.length) / max(one.length, other.length), motion
 
 
 def _same_length(a: WallSegment, b: WallSegment) -> bool:
@@ -138,8 +141,9 @@ def segment_motions(
 ) -> list[tuple[Array, Array, Displacement]]:
     """Line landmarks that both maps have with the same length, but at different poses.
 
-    An object that moved by less than its size occludes its old place, so no beam shows that it has
-    left: this way its motion is found nevertheless. ``surfaces``, ``visits`` and ``evidence`` are
+    Those that face another way are other faces, of that object or of another. An object that moved
+    by less than its size occludes its old place, so no beam shows that it has left: this way its
+    motion is found nevertheless. ``surfaces``, ``visits`` and ``evidence`` are
     those of `AlignedVisits`; landmarks are in each map's own frame. ``sigma``: see
     `graphslam.change_detection.beam_evidence.null_sigma`.
 
@@ -159,15 +163,16 @@ def segment_motions(
     for i, a in enumerate(sides[0]):
         for j, b in enumerate(sides[1]):
             distance = float(np.hypot(*(b.pose[:2] - a.pose[:2])))
-            if _same_length(a, b) and distance < settings.max_displacement_m:
-                pairs.append((abs(a.length - b.length) + 0.1 * distance, i, j))
+            motion = motion_between_segments(a, b, settings)
+            alike = _same_length(a, b) and motion.is_plausible
+            if alike and distance < settings.max_displacement_m:
+                pairs.append((abs(a.length - b.length) + 0.1 * distance, i, j, motion))
     moved, taken = [], (set[int](), set[int]())
-    for _, i, j in sorted(pairs):
+    for _, i, j, motion in sorted(pairs, key=lambda pair: pair[:3]):
         if i not in taken[0] and j not in taken[1]:
             taken[0].add(i)
             taken[1].add(j)
-            a, b = sides[0][i], sides[1][j]
-            moved.append((a.ends, b.ends, motion_between_segments(a, b, settings)))
+            moved.append((sides[0][i].ends, sides[1][j].ends, motion))
     return moved
 
 

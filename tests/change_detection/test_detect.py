@@ -770,3 +770,27 @@ def test_a_board_whose_end_is_hidden_is_not_said_to_have_moved():
     screen = Outline("screen", np.array([[4.9, 2.9], [5.1, 4.6]]))
     for change in turned_board(0, more=[screen]).changes:
         assert change.displacement is None
+
+
+@pytest.mark.parametrize("lines", [False, True])
+def test_a_box_of_which_opposite_faces_were_seen_has_no_stated_displacement(lines):
+    """Carried across the path: its southern face was seen, then its northern one. They look like
+    one face that was turned by half a turn; neither tells how deep the box is. With and without
+    the lines that both maps have of the faces. Breaks if straight shapes may turn by any angle."""
+    rng = np.random.default_rng(26)
+    # from in front of both places only, where no end of either box is in sight
+    x, sides = np.linspace(3.9, 4.6, 60), np.tile([np.pi / 2, -np.pi / 2, 0.0], 20)
+    poses = np.column_stack([x, np.full(60, 3.0), sides])
+    first, second = box(3.5, 4.4, 1.2, 0.3), box(3.8, 1.0, 1.2, 0.3)
+    faces = first.points[:2], second.points[2:]
+    seen = [
+        replace(
+            visit([thing], poses, rng),
+            landmarks=(*walls(), *([board_line(50, face)] if lines else [])),
+        )
+        for thing, face in ((first, faces[0]), (second, faces[1]))
+    ]
+    found = detect_changes(*seen, CONFIG)
+    assert {change.kind for change in found.changes} == {"vanished", "appeared"}
+    for change in found.changes:
+        assert change.displacement is None
