@@ -12,6 +12,7 @@ import numpy as np
 
 from graphslam.change_detection.beam_evidence import (
     Evidence,
+    agreeing_share,
     beams_past_surfaces,
     half_beam_spacing,
     null_sigma,
@@ -40,9 +41,15 @@ _REFERENCE_ROUNDS = 2
 #: this share of them the scans are aligned again without them
 _SUSPECT_SIGMAS, _MAX_SUSPECTS = 3.0, 0.03
 _OVERLAP = 0.05  # least share of the later returns on surfaces of the reference
-#: null sigma above which two maps are not of one place, by whether the registration is nonrigid: a
-#: path that was bent to fit should leave less; and from which on there is a warning
-_MAX_SIGMA, _WARN_SIGMA = {False: 5.0, True: 1.8}, 1.5
+#: null sigma above which two maps, registered rigidly, are not of one place, and from which on
+#: there is a warning
+_MAX_SIGMA, _WARN_SIGMA = 5.0, 1.5
+#: two maps are not of one place if less than this share agrees, to so many sigmas: of the surface
+#: that both saw (where all furniture of a room moved 0.81 to 0.87 agree, where two of its four
+#: walls are elsewhere 0.75);
+#: after a nonrigid registration of the beams, as a path that was bent to fit should leave less
+_LEAST_AGREEMENT = {False: 0.78, True: 0.8}
+_AGREEING_SIGMAS = {False: 5.0, True: 2.2}
 #: surface with a higher score is elsewhere in the other visit. Scans prefer another pose than that
 #: which landmarks explain best if it has less of that than this share
 _ELSEWHERE_SIGMAS, _CLEARLY = 5.0, 0.5
@@ -68,8 +75,19 @@ class AlignedVisits:
 
     @property
     def is_inconsistent(self) -> bool:
-        """Whether the visits disagree too much to be of one place."""
-        return null_sigma(self.evidence) > _MAX_SIGMA[self.nonrigid]
+        """Whether the visits disagree too much to be of one place.
+
+        What changed does not count unless it is most of what was seen: what did not still agrees.
+        """
+        too_far = not self.nonrigid and null_sigma(self.evidence) > _MAX_SIGMA
+        return too_far or self.agreement < _LEAST_AGREEMENT[self.nonrigid]
+
+    @property
+    def agreement(self) -> float:
+        """Share of what both visits saw that is where the other saw it."""
+        sigma = 1.0 if self.nonrigid else max(null_sigma(self.evidence), 1.0)
+        gate = _AGREEING_SIGMAS[self.nonrigid] * sigma
+        return agreeing_share(self.evidence, gate, per_beam=self.nonrigid)
 
 
 def align_visits(
@@ -245,7 +263,8 @@ def consistency_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
     if aligned.is_inconsistent:
         raise OutputError(
             f"nothing to compare: the surfaces of the two runs disagree by {sigma:.1f} times what "
-            "their covariances allow; they are of different places, or one of the maps is broken"
+            f"their covariances allow, and only {100 * aligned.agreement:.0f} % of them agree to "
+            "that; they are of different places, or one of the maps is broken"
         )
     if sigma < _WARN_SIGMA:
         return ()
