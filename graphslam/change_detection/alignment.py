@@ -30,7 +30,7 @@ from graphslam.change_detection.surface_map import Surface, fit_surfaces
 from graphslam.change_detection.visit import Bools, Ints, Visit
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
-from graphslam.core.geometry import Array
+from graphslam.core.geometry import Array, wrap
 
 #: gates over `max_pose_error_m`, one per iteration, from coarse to fine: of the later visit, and of
 #: the reference, whose scans the surfaces are made of
@@ -50,9 +50,11 @@ _MAX_SIGMA, _WARN_SIGMA = 5.0, 1.5
 #: after a nonrigid registration of the beams, as a path that was bent to fit should leave less
 _LEAST_AGREEMENT = {False: 0.78, True: 0.8}
 _AGREEING_SIGMAS = {False: 5.0, True: 2.2}
-#: surface with a higher score is elsewhere in the other visit. Scans prefer another pose than that
-#: which landmarks explain best if it has less of that than this share
-_ELSEWHERE_SIGMAS, _CLEARLY = 5.0, 0.5
+#: surface with a higher score is elsewhere in the other visit. Shares of that which differ by less
+#: than _TIE are equal; one is clearly less than another if it is below this part of it
+_ELSEWHERE_SIGMAS, _TIE, _CLEARLY = 5.0, 0.01, 0.5
+#: a pose counts if it compares at least this part of the surface that another one compares
+_ENOUGH = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +63,9 @@ class AlignedVisits:
 
     ``surfaces``, ``range_sigmas_m``: of the reference and of the later visit; ``evidence``: later
     beams on reference surfaces, reference beams on later surfaces; ``config``: the settings for the
-    comparison; ``nonrigid``: whether the maps were bent against each other.
+    comparison; ``nonrigid``: whether the maps were bent against each other; ``rivals``: other poses
+    (3,) of the later frame that explain the scans nearly as well, each with the share of surface
+    that is elsewhere there, which is ``elsewhere`` at the pose that was taken.
     """
 
     reference: Visit
@@ -72,6 +76,8 @@ class AlignedVisits:
     evidence: tuple[Evidence, Evidence]
     config: ChangesConfig
     nonrigid: bool
+    rivals: tuple[tuple[Array, float], ...] = ()
+    elsewhere: float = 0.0
 
     @property
     def is_inconsistent(self) -> bool:
@@ -117,9 +123,30 @@ def align_visits(
         except OutputError:
             if number == len(rivals) and not tried:
                 raise
-    shares = [_share_elsewhere(aligned.evidence) for aligned in tried]
+    return _best_of(tried)
+
+
+def _best_of(tried: list[AlignedVisits]) -> AlignedVisits:
+    """Of the visits, aligned at several poses, those at which least of the surface is elsewhere.
+
+    In doubt at that which landmarks explain best, the first. With the poses that are as good.
+    """
+    shares = np.array([_share_elsewhere(one.evidence) for one in tried])
+    # a pose at which the visits have little in common has little to be elsewhere as well
+    tests = np.array([sum(int(e.tested.sum()) for e in one.evidence) for one in tried])
+    shares = np.where(tests >= _ENOUGH * tests.max(), shares, 1.0)
     k = int(np.argmin(shares))
-    return tried[k if shares[k] < _CLEARLY * shares[0] else 0]
+    k = k if shares[k] < shares[0] - _TIE else 0
+    alike = tuple(
+        (one.registration.pose, float(share))
+        for i, (one, share) in enumerate(zip(tried, shares, strict=True))
+        if i != k and not one.is_inconsistent and not _is_clearly_less(shares[k], share)
+    )
+    return replace(tried[k], rivals=alike, elsewhere=float(shares[k]))
+
+
+def _is_clearly_less(share: float, other: float) -> bool:
+    return share < _CLEARLY * other and other - share > _TIE
 
 
 def _align_rigidly(
@@ -254,7 +281,7 @@ def laser_warnings(reference: Visit, later: Visit) -> tuple[str, ...]:
 
 
 def consistency_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
-    """A warning if the visits disagree all over by more than their covariances allow.
+    """Warnings if the visits disagree all over by more than is stated, or fit at several poses.
 
     Raises:
         OutputError: by so much more that they are hardly of one place.
@@ -266,9 +293,28 @@ def consistency_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
             f"their covariances allow, and only {100 * aligned.agreement:.0f} % of them agree to "
             "that; they are of different places, or one of the maps is broken"
         )
+    warnings = _rival_warnings(aligned)
     if sigma < _WARN_SIGMA:
-        return ()
+        return warnings
     return (
+        *warnings,
         f"the surfaces of the two runs disagree by {sigma:.1f} times what their covariances "
         "allow, everywhere; a trajectory's covariance is too small, and changes may be false",
     )
+
+
+def _rival_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
+    """A warning if the place looks alike from several poses, as a symmetric room does."""
+    if not aligned.rivals:
+        return ()
+    others = ", or ".join(f"{_pose_text(pose)}, {100 * n:.1f} %" for pose, n in aligned.rivals)
+    taken = _pose_text(aligned.registration.pose)
+    return (
+        f"the place looks alike from several poses: the later map was taken to lie at {taken}, "
+        f"where {100 * aligned.elsewhere:.1f} % of the surface is elsewhere; it may lie at {others}"
+        ", and then the changes are others",
+    )
+
+
+def _pose_text(pose: Array) -> str:
+    return f"({pose[0]:.2f} m, {pose[1]:.2f} m, {np.degrees(wrap(pose[2])):.0f} deg)"

@@ -44,8 +44,9 @@ _GATE = float(chi2_quantile(0.999, 2))
 _MAX_PAIRS = 2500
 #: factors on the gates of the matching, one per iteration of the refinement
 _SLACKS = (8.0, 4.0, 2.0, 1.0, 1.0, 1.0)
-#: share of the best score from which on another pose explains nearly as much, and how many are told
-_NEARLY, _RIVALS = 0.7, 3
+#: share of the best score from which on another pose explains nearly as much, and how many are
+#: told: a square room looks the same from four
+_NEARLY, _RIVALS = 0.7, 4
 #: m, m, rad: poses that differ by less are one
 _SAME = (0.5, 0.5, 0.05)
 #: least information of a registration: no direction may be known worse than to 0.1 m or 0.1 rad

@@ -781,11 +781,11 @@ def test_a_box_of_which_opposite_faces_were_seen_has_no_stated_displacement(line
     # from in front of both places only, where no end of either box is in sight
     x, sides = np.linspace(3.9, 4.6, 60), np.tile([np.pi / 2, -np.pi / 2, 0.0], 20)
     poses = np.column_stack([x, np.full(60, 3.0), sides])
-    first, second = box(3.5, 4.4, 1.2, 0.3), box(3.8, 1.0, 1.2, 0.3)
+    first, second, stays = box(3.5, 4.4, 1.2, 0.3), box(3.8, 1.0, 1.2, 0.3), box(6.9, 2, 0.5, 1.4)
     faces = first.points[:2], second.points[2:]
     seen = [
         replace(
-            visit([thing], poses, rng),
+            visit([thing, stays], poses, rng),
             landmarks=(*walls(), *([board_line(50, face)] if lines else [])),
         )
         for thing, face in ((first, faces[0]), (second, faces[1]))
