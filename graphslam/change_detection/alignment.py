@@ -27,7 +27,7 @@ from graphslam.change_detection.rigid_registration import (
 )
 from graphslam.change_detection.scan_to_map import align_scans
 from graphslam.change_detection.surface_map import Surface, fit_surfaces
-from graphslam.change_detection.visit import Bools, Ints, Visit
+from graphslam.change_detection.visit import Bools, Ints, Visit, scatter_of_ranges
 from graphslam.core.config import ChangesConfig
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array, wrap
@@ -53,6 +53,11 @@ _AGREEING_SIGMAS = {False: 5.0, True: 2.2}
 #: surface with a higher score is elsewhere in the other visit. Shares of that which differ by less
 #: than _TIE are equal; one is clearly less than another if it is below this part of it
 _ELSEWHERE_SIGMAS, _TIE, _CLEARLY = 5.0, 0.01, 0.5
+#: least side of a cell, in sigmas of the range noise: five cells must be longer than noise is wide,
+#: or a window has no direction
+_CELL_SIGMAS = 1.55
+#: least share of the returns that lie on surface which is compared, without a warning
+_LEAST_USABLE = 0.6
 #: a pose counts if it compares at least this part of the surface that another one compares
 _ENOUGH = 0.5
 
@@ -94,6 +99,16 @@ class AlignedVisits:
         sigma = 1.0 if self.nonrigid else max(null_sigma(self.evidence), 1.0)
         gate = _AGREEING_SIGMAS[self.nonrigid] * sigma
         return agreeing_share(self.evidence, gate, per_beam=self.nonrigid)
+
+
+def settings_for_noise(reference: Visit, later: Visit, config: ChangesConfig) -> ChangesConfig:
+    """The settings, with cells and the first range noise as large as the noisier laser asks for."""
+    sigma = max(scatter_of_ranges(reference), scatter_of_ranges(later))
+    return replace(
+        config,
+        resolution_m=max(config.resolution_m, _CELL_SIGMAS * sigma),
+        range_sigma_m=max(config.range_sigma_m, sigma),
+    )
 
 
 def align_visits(
@@ -293,7 +308,7 @@ def consistency_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
             f"their covariances allow, and only {100 * aligned.agreement:.0f} % of them agree to "
             "that; they are of different places, or one of the maps is broken"
         )
-    warnings = _rival_warnings(aligned)
+    warnings = _rival_warnings(aligned) + _usable_warnings(aligned)
     if sigma < _WARN_SIGMA:
         return warnings
     return (
@@ -314,6 +329,23 @@ def _rival_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
         f"where {100 * aligned.elsewhere:.1f} % of the surface is elsewhere; it may lie at {others}"
         ", and then the changes are others",
     )
+
+
+def _usable_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
+    """A warning for each visit of which many returns lie on no surface that is compared."""
+    found = []
+    for name, surface, sigma in zip(
+        ("reference", "later run"), aligned.surfaces, aligned.range_sigmas_m, strict=True
+    ):
+        returns = int((surface.beams >= 0).sum())
+        usable = len(beams_on_surface(surface)[0]) / max(returns, 1)
+        if usable < _LEAST_USABLE:
+            found.append(
+                f"only {100 * usable:.0f} % of the returns of the {name}, whose range noise is "
+                f"{100 * sigma:.1f} cm, lie on straight surface that can be compared; what changed "
+                "elsewhere is not found"
+            )
+    return tuple(found)
 
 
 def _pose_text(pose: Array) -> str:

@@ -17,6 +17,7 @@ from graphslam.change_detection.alignment import (
     beams_on_surface,
     consistency_warnings,
     laser_warnings,
+    settings_for_noise,
 )
 from graphslam.change_detection.beam_evidence import Evidence, null_sigma, repeatability
 from graphslam.change_detection.objects import (
@@ -109,6 +110,7 @@ def detect_changes(
         OutputError: the two cannot be registered, or have nothing in common.
     """
     warnings = laser_warnings(reference, later)
+    config = settings_for_noise(reference, later, config)
     aligned = align_visits(reference, later, registration, config)
     one_robot = max(reference.robots, later.robots) == 1
     if aligned.is_inconsistent and registration is None and one_robot:

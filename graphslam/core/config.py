@@ -307,19 +307,20 @@ class ChangesConfig:
 
     false_alarm_rate: share of the later beams that are flagged where nothing changed.
     run_false_alarm_rate: probability that a run without any change reports one. resolution_m: of
-    the map; coarser where the map would have more than max_side_cells squared cells. min_range_m,
-    max_range_m: nearer returns (the vehicle itself, dust, error codes) and farther ones are not
-    used. edge_gap_m, edge_gap_ratio: a return is at an edge, and not used, if the next beam's is
-    farther from it than edge_gap_m + edge_gap_ratio * range. range_sigma_m: range noise until it is
-    estimated from the scans. max_pose_error_m: largest error of a later scan's position that
-    alignment with the reference's surfaces corrects. min_returns, min_scans: a surface is compared
-    if it has so many returns from so many scans. flatness_m: deviation of a straight surface from
-    a line. bias_sigma_m: range bias that depends on the material. gate_m: returns within this
-    distance of a surface are compared with it; beams that end farther behind it passed through it.
-    nonrigid_gate_m: gate_m, at least, where the maps are bent against each other. min_length_m:
-    smallest change that is reported. min_beams: fewest beams that support one.
-    max_displacement_m: what moved farther is reported as vanished and appeared. consecutive_beams:
-    of the thesis' method: so many neighbouring beams must differ (section 5.3); 1 = one is enough.
+    the map; coarser where the map would have more than max_side_cells squared cells, or ranges are
+    too noisy for it. min_range_m, max_range_m: nearer returns (the vehicle itself, dust, error
+    codes) and farther ones are not used. edge_gap_m, edge_gap_ratio: a return is at an edge, and
+    not used, if the next beam's is farther from it than edge_gap_m + edge_gap_ratio * range.
+    range_sigma_m: range noise until it is estimated from the scans. max_pose_error_m: largest error
+    of a later scan's position that alignment with the reference's surfaces corrects. min_returns,
+    min_scans: a surface is compared if it has so many returns from so many scans. flatness_m:
+    deviation of a straight surface from a line. bias_sigma_m: range bias that depends on the
+    material. gate_m: returns within this distance of a surface are compared with it; beams that end
+    farther behind it passed through it. nonrigid_gate_m: gate_m, at least, where the maps are bent
+    against each other. min_length_m: smallest change that is reported. min_beams: fewest beams that
+    support one. max_displacement_m: what moved farther is reported as vanished and appeared.
+    consecutive_beams: of the thesis' method: so many neighbouring beams must differ (section 5.3);
+    1 = one is enough.
     """
 
     false_alarm_rate: float = 0.01
