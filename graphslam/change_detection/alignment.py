@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.change_detection.beam_evidence import (
+    DOUBTFUL_SIGMA,
     Evidence,
     agreeing_share,
     beams_past_surfaces,
@@ -41,9 +42,8 @@ _REFERENCE_ROUNDS = 2
 #: this share of them the scans are aligned again without them
 _SUSPECT_SIGMAS, _MAX_SUSPECTS = 3.0, 0.03
 _OVERLAP = 0.05  # least share of the later returns on surfaces of the reference
-#: null sigma above which two maps, registered rigidly, are not of one place, and from which on
-#: there is a warning
-_MAX_SIGMA, _WARN_SIGMA = 5.0, 1.5
+#: null sigma above which two maps, registered rigidly, are not of one place
+_MAX_SIGMA = 5.0
 #: two maps are not of one place if less than this share agrees, to so many sigmas: of the surface
 #: that both saw (where all furniture of a room moved 0.81 to 0.87 agree, where two of its four
 #: walls are elsewhere 0.75);
@@ -309,12 +309,13 @@ def consistency_warnings(aligned: AlignedVisits) -> tuple[str, ...]:
             "that; they are of different places, or one of the maps is broken"
         )
     warnings = _rival_warnings(aligned) + _usable_warnings(aligned)
-    if sigma < _WARN_SIGMA:
+    if sigma < DOUBTFUL_SIGMA:
         return warnings
     return (
         *warnings,
         f"the surfaces of the two runs disagree by {sigma:.1f} times what their covariances "
-        "allow, everywhere; a trajectory's covariance is too small, and changes may be false",
+        "allow, everywhere; a trajectory's covariance is too small, or materials bias the ranges "
+        "of two lasers differently; changes may be false, and their probabilities allow for it",
     )
 
 

@@ -40,6 +40,8 @@ _CUT, _BULK, _ROUNDS = 4.0, 0.8, 20
 _TAILS = 1.05
 #: lower bound on the estimated sigma of the null distribution, and least number of scores for it
 _MIN_SIGMA, _MIN_SCORES = 0.86, 100
+#: null sigma from which on the two visits disagree for reasons that nobody stated
+DOUBTFUL_SIGMA = 1.5
 #: beams traced at a time, which bounds the memory
 _CHUNK = 400_000
 

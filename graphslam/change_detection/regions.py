@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.stats import norm
 
-from graphslam.change_detection.beam_evidence import Evidence
+from graphslam.change_detection.beam_evidence import DOUBTFUL_SIGMA, Evidence
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.surface_map import WINDOW, Surface
 from graphslam.change_detection.visit import Bools, Ints
@@ -76,7 +76,9 @@ def find_regions(
         count = len(np.unique(beams[np.isin(beam_rows, members)]))
         if count < config.min_beams:
             continue
-        expected = tests * norm.sf(min(float(strongest[enough - 1]), 30.0))
+        expected = _expected_by_chance(
+            float(strongest[enough - 1]), tests, int(evidence.tested.sum()) * grid.cell_m, sigma
+        )
         found.append(
             Region(
                 members, surface.points[members], outline(grid, surface.cells[members]),
@@ -84,6 +86,18 @@ def find_regions(
             )
         )  # fmt: skip
     return found
+
+
+def _expected_by_chance(score: float, tests: float, length_m: float, sigma: float) -> float:
+    """How many regions with such a score a run without changes shows.
+
+    Of ``tests`` independent ones, on ``length_m`` of surface. Where visits disagree for a reason
+    that nobody stated, scores have an unknown distribution, and a whole thing or stretch of wall,
+    taken as a metre, is off alike: then that is Cantelli's bound, whatever the distribution.
+    """
+    if sigma < DOUBTFUL_SIGMA:
+        return tests * float(norm.sf(min(score, 30.0)))
+    return max(length_m, 1.0) / (1 + score**2)
 
 
 def connected_components(grid: Grid, cells: Ints, join_cells: int = _JOIN_CELLS) -> Ints:

@@ -11,7 +11,10 @@ import pytest
 from test_detect import CONFIG, FAN, SIGMA, box, drive, visit, walls
 
 from graphslam.change_detection import detect_changes
-from graphslam.change_detection.beam_evidence import Evidence, null_sigma
+from graphslam.change_detection.beam_evidence import Evidence, beams_past_surfaces, null_sigma
+from graphslam.change_detection.grid import grid_over
+from graphslam.change_detection.regions import find_regions
+from graphslam.change_detection.surface_map import fit_surfaces
 from graphslam.change_detection.visit import on_surface, scatter_of_ranges
 from graphslam.core.geometry import between, inverse
 
@@ -141,3 +144,25 @@ def test_returns_on_no_surface_are_told():
     marks = tuple(walls())
     found = detect_changes(replace(a, landmarks=marks), replace(b, landmarks=marks), CONFIG)
     assert any("straight surface" in warning for warning in found.warnings)
+
+
+def test_where_visits_disagree_all_over_a_change_is_less_certain():
+    """Scores that are stated with their sigmas, and those of which one wall in ten is off by six, as
+    materials do that bias another laser otherwise. Breaks if either is that of a normal law."""
+    rng = np.random.default_rng(43)
+    before, after = visit([], drive(60), rng), visit([box(5, 4)], drive(60, 0.1), rng)
+    surface = fit_surfaces(after, grid_over(after.ends, 0.025, 10**6), SIGMA, CONFIG)
+    past = beams_past_surfaces(surface, before, SIGMA, CONFIG)
+    behind = past.scores(1.0) > 10
+    assert behind.any()
+
+    def probability(score, sigma):
+        """Of the box, its surface being so many sigmas off."""
+        offset = np.where(behind, score * sigma * np.sqrt(past.variance), 0.0)
+        shown = (replace(past, offset=offset), past.beams, past.rows, past.first_ns)
+        return max(r.probability for r in find_regions(surface, *shown, sigma, CONFIG))
+
+    assert probability(6.0, 1.0) > 0.999
+    # some 25 m of surface, and Cantelli's 1 / (1 + 36): about even; beams that pass are 30 and more
+    assert 0.4 < probability(6.0, 2.0) < 0.75
+    assert probability(30.0, 2.0) > 0.95
