@@ -147,8 +147,8 @@ def test_returns_on_no_surface_are_told():
 
 
 def test_where_visits_disagree_all_over_a_change_is_less_certain():
-    """Scores that are stated with their sigmas, and those of which one wall in ten is off by six, as
-    materials do that bias another laser otherwise. Breaks if either is that of a normal law."""
+    """Where sigmas are as stated six of them are certain; where a spread of 2 tells that they are not,
+    they are not: materials may bias another laser. Breaks if both are by the normal law."""
     rng = np.random.default_rng(43)
     before, after = visit([], drive(60), rng), visit([box(5, 4)], drive(60, 0.1), rng)
     surface = fit_surfaces(after, grid_over(after.ends, 0.025, 10**6), SIGMA, CONFIG)
