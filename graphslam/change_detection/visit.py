@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from graphslam.core.config import ChangesConfig
-from graphslam.core.errors import LogError, OutputError
+from graphslam.core.errors import ConfigError, LogError, OutputError
 from graphslam.core.geometry import Array, between, compose, compose_cov, polar_points, unit_vectors
 from graphslam.core.records import Landmark, Scan
 from graphslam.logs import open_logs
@@ -156,9 +156,15 @@ def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEF
     ``directory``: where the folder is, for messages.
 
     Raises:
+        ConfigError: no range is between the least and the largest that are used.
         LogError: a log is missing or has changed.
         OutputError: the result has no scans or no covariances, or several frames.
     """
+    if config.min_range_m >= config.max_range_m:
+        raise ConfigError(
+            f"changes.min_range_m: must be below changes.max_range_m, which is "
+            f"{config.max_range_m:g}, got {config.min_range_m:g}"
+        )
     check_one_frame(saved, directory)
     logs = saved.summary["logs"]
     log = open_logs([Path(entry["path"]) for entry in logs], saved.config)

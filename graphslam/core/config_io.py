@@ -314,6 +314,7 @@ _INFINITE = {"association.delete_s", "backend.horizon_s", "limits.memory_mb"}
 
 #: settings that would be a divisor of 0, or make a covariance singular
 _NOT_ZERO = {
+    "consecutive_beams",
     "scale",
     "split_m",
     "hough_delta_d_m",

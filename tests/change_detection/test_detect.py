@@ -31,7 +31,7 @@ from graphslam.change_detection.surface_map import fit_surfaces
 from graphslam.change_detection.visit import on_surface, select_time_span
 from graphslam.cli.commands import app
 from graphslam.core.config import ChangesConfig, Config
-from graphslam.core.errors import OutputError
+from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import between, compose, inverse, rotation, transform, wrap
 from graphslam.core.records import Landmark
 from graphslam.logs import open_logs
@@ -691,6 +691,13 @@ def test_a_result_without_covariances_is_one_clear_line(lab_run, tmp_path):
     path.write_text("\n".join([head, *empty, ""]))
     with pytest.raises(OutputError, match="vehicle has no covariances"):
         load_visit(load(tmp_path / "result"), tmp_path / "result")
+
+
+def test_no_range_between_the_limits_is_one_clear_line(lab_run):
+    """By either method; not an IndexError from an empty map."""
+    none = replace(CONFIG, min_range_m=40.0)
+    with pytest.raises(ConfigError, match=r"min_range_m: must be below .* which is 30, got 40"):
+        load_visit(load(lab_run), lab_run, none)
 
 
 def test_several_robots_have_no_nonrigid_registration():

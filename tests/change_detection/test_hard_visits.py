@@ -147,7 +147,7 @@ def test_returns_on_no_surface_are_told():
 
 
 def test_where_visits_disagree_all_over_a_change_is_less_certain():
-    """Where sigmas are as stated six of them are certain; where a spread of 2 tells that they are not,
+    """Six sigmas are certain if sigmas are as stated. Where a spread of 2 tells that they are not,
     they are not: materials may bias another laser. Breaks if both are by the normal law."""
     rng = np.random.default_rng(43)
     before, after = visit([], drive(60), rng), visit([box(5, 4)], drive(60, 0.1), rng)

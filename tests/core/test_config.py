@@ -70,6 +70,7 @@ def one_line(error):
         ("robust.scale=-1", "robust.scale: must not be negative, got -1.0"),
         ("front_end.min_points=-1", "front_end.min_points: must not be negative, got -1"),
         ("robust.scale=0", "robust.scale: must be greater than 0"),
+        ("changes.consecutive_beams=0", "changes.consecutive_beams: must be greater than 0"),
         ("backend.relinearize_every=0", "backend.relinearize_every: must be greater than 0"),
         ("odometry.max_gap_s=1e300", "odometry.max_gap_s: must not exceed a million, got 1e+300"),
         ("association.gate_probability=2", "association.gate_probability: must be between 0 and"),
