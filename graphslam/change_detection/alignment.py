@@ -259,13 +259,9 @@ def _evidence(
 
 
 def _share_elsewhere(evidence: tuple[Evidence, ...]) -> float:
-    """Share of the surface that both visits saw which is elsewhere in the other.
-
-    Beams that end in front of a surface do not count: of a thin wall they may be on the other face.
-    What moved towards the laser is behind it in the other direction.
-    """
+    """Share of the surface that both visits saw which is elsewhere in the other."""
     scores = np.concatenate([e.scores(1.0)[e.tested] for e in evidence])
-    return float(np.mean(scores > _ELSEWHERE_SIGMAS)) if len(scores) else 1.0
+    return float(np.mean(np.abs(scores) > _ELSEWHERE_SIGMAS)) if len(scores) else 1.0
 
 
 def _suspects(aligned: AlignedVisits) -> Bools:

@@ -82,7 +82,7 @@ def beams_past_surfaces(
     """Evidence of the beams of ``visit``, of range noise ``sigma_m``, on the other's surfaces."""
     used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
     ends, directions = visit.ends_of(used), visit.directions[used]
-    row, e, found = surface_offsets(surface, visit, used, ends, config.gate_m)
+    row, e, found = surface_offsets(surface, ends, config.gate_m)
     cosine = np.einsum("ni,ni->n", surface.normals[row], directions[found])
     near = (row, used[found], np.sign(cosine) * e, np.abs(cosine))
     row, beam, cosine = crossings(surface, visit, used, config.gate_m)
@@ -218,7 +218,7 @@ def _candidates(surface: Surface, visit: Visit, used: Ints) -> tuple[Ints, Ints]
 def range_noise(surface: Surface, visit: Visit, config: ChangesConfig) -> float:
     """Range noise sigma, m, from the median absolute offset of returns from their surfaces."""
     beams = np.nonzero(visit.surface)[0]
-    row, e, found = surface_offsets(surface, visit, beams, visit.ends_of(beams), config.gate_m)
+    row, e, found = surface_offsets(surface, visit.ends_of(beams), config.gate_m)
     cosine = np.abs(np.einsum("ni,ni->n", surface.normals[row], visit.directions[beams[found]]))
     face_on = cosine > 0.5
     if not face_on.any():

@@ -62,7 +62,7 @@ def scan_normal_equations(
     of a surface.
     """
     ends, size = visit.ends_of(beams), len(visit.poses)
-    row, e, found = surface_offsets(surface, visit, beams, ends, gate_m)
+    row, e, found = surface_offsets(surface, ends, gate_m)
     scan = visit.scan[beams][found]
     n, arm = surface.normals[row], ends[found] - visit.poses[scan, :2]
     terms, squared = point_terms(e[:, None] * n, line_metrics(n), arm)
@@ -72,15 +72,12 @@ def scan_normal_equations(
     return information, -gradient
 
 
-def surface_offsets(
-    surface: Surface, visit: Visit, beams: Ints, ends: Array, gate_m: float
-) -> tuple[Ints, Array, Ints]:
-    """Distances of the ``ends`` (k, 2) m of ``beams`` (k,) from the surface next to them.
+def surface_offsets(surface: Surface, ends: Array, gate_m: float) -> tuple[Ints, Array, Ints]:
+    """Distances of points ``ends`` (k, 2) m from the surface next to them.
 
     Returns:
-        For those ends whose nearest piece is good, within the gate, beside them, and not seen from
-        the other side only: rows (f,) of the pieces, signed distances (f,) m along their normals,
-        indices (f,) of the ends.
+        For those points whose nearest piece is good, within the gate, and beside them: rows (f,) of
+        the pieces, signed distances (f,) m along their normals, indices (f,) of the points.
     """
     grid = surface.nearest.grid
     cell = grid.cells(ends)
@@ -93,8 +90,4 @@ def surface_offsets(
     found = np.nonzero(
         near & surface.good[row] & (np.abs(e) < gate_m) & (along < 1.5 * grid.cell_m)
     )[0]
-    one = np.nonzero(surface.one_sided[row[found]])[0]
-    lasers = visit.poses[visit.scan[beams[found[one]]], :2]
-    ahead = np.einsum("ni,ni->n", surface.facing[row[found[one]]], ends[found[one]] - lasers)
-    found = np.delete(found, one[ahead < 0])
     return row[found].astype(np.int64), np.asarray(e[found]), np.asarray(found, dtype=np.int64)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_detect import CONFIG, FAN, SIGMA, box, drive, same, visit, walls
+from test_detect import CONFIG, FAN, SIGMA, box, drive, visit, walls
 
 from graphslam.change_detection import detect_changes
 from graphslam.change_detection.beam_evidence import Evidence, beams_past_surfaces, null_sigma
@@ -16,7 +16,7 @@ from graphslam.change_detection.grid import grid_over
 from graphslam.change_detection.regions import find_regions
 from graphslam.change_detection.surface_map import fit_surfaces
 from graphslam.change_detection.visit import on_surface, scatter_of_ranges
-from graphslam.core.geometry import between, inverse, wrap
+from graphslam.core.geometry import between, inverse
 
 # ------------------------------------------------------------ much changed
 
@@ -166,39 +166,3 @@ def test_where_visits_disagree_all_over_a_change_is_less_certain():
     # some 25 m of surface, and Cantelli's 1 / (1 + 36): about even; beams that pass are 30 and more
     assert 0.4 < probability(6.0, 2.0) < 0.75
     assert probability(30.0, 2.0) > 0.95
-
-
-# ------------------------------------------------------------ thin walls seen from both sides
-
-
-def both_sides(n, turn=0.0):
-    """Poses on two small circles, west and east of the room's middle, looking around."""
-    t = np.linspace(0, 2 * np.pi, n // 2, endpoint=False) + turn
-    west = np.column_stack([2 + 0.7 * np.cos(t), 3 + 0.7 * np.sin(t), wrap(2 * t)])
-    return np.concatenate([west, west + np.array([4.0, 0.0, 0.0])])
-
-
-@pytest.mark.parametrize("thick", [0.03, 0.05, 0.08, 0.1])
-def test_a_thin_wall_that_is_seen_from_both_sides_is_found_whole(thick):
-    """Both faces are in one window of 12.5 cm. Breaks if one line is fitted to both: nothing is
-    straight there, and walls of 3 to 6 cm are missed, of thicker ones pieces are found."""
-    rng = np.random.default_rng(44)
-    wall = box(4 - thick / 2, 1.5, thick, 2.6)
-    a, b = visit([], both_sides(80), rng), visit([wall], both_sides(80, 0.1), rng)
-    for before, after, kind in ((a, b, "appeared"), (b, a, "vanished")):
-        (change,) = same(before, after).changes
-        assert change.kind == kind
-        # two cells less at each end, where beams are at edges
-        assert np.ptp(change.polygon[:, 1]) > 2.6 - 4 * 0.025
-
-
-@pytest.mark.parametrize("seed", [5, 6])
-def test_a_thin_wall_that_one_visit_saw_from_one_side_only_is_the_same(seed):
-    """In a room that looks alike after half a turn, which the wall tells apart. Breaks if beams
-    that end at the other face, in front of this one, tell that the wall is elsewhere."""
-    rng = np.random.default_rng(seed)
-    wall = box(3.96, 1.5, 0.08, 2.6)
-    a, b = visit([wall], both_sides(80), rng), visit([wall], both_sides(80, 0.1)[:40], rng)
-    found = same(a, b)
-    np.testing.assert_allclose(found.registration.pose, 0, atol=0.1)
-    assert not found.changes
