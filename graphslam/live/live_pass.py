@@ -105,7 +105,7 @@ class LivePass(Pipeline):
             if self._busy <= BUSY:
                 return  # such a scan takes time enough
         self._busy = 0
-        found = self._closer.closures()
+        found = self._closer.closures(self.last_ns)
         if not found:
             return
         self.backend.add(Step(self.last_ns, closures=found))

@@ -41,6 +41,8 @@ from graphslam.mapping.submaps import MIN_POINTS, State, SubmapPose, submaps_aro
 MOST_COMPARED = 4
 #: comparisons that wait, at most: where all scans are keyframes, older ones are given up
 MOST_WAITING = 16
+#: ns between comparisons, at least: scans that come all at once do not wait for many of them
+APART_NS = 100_000_000
 #: places that must agree, at least: if the estimate may be as far off as they say, and if its
 #: covariance denies that; m: the last ones are so far back
 AGREEING, AGAINST, RECENT_M = 2, 3, 40.0
@@ -94,6 +96,7 @@ class LoopCloser:
         self._places: list[SubmapPose] = []
         self._waiting: deque[SubmapPair] = deque(maxlen=MOST_WAITING)
         self._asked: tuple[SubmapPair, Future[list[Verified | None]]] | None = None
+        self._asked_ns = 0
         self._found: list[Closure] = []  # of recent places
         self._repeated: set[State] = set()  # places that are earlier ones
 
@@ -181,8 +184,8 @@ class LoopCloser:
                 pairs.append(SubmapPair(place, others[k], guess, window))
         return pairs
 
-    def closures(self) -> tuple[Closure, ...]:
-        """The closures that are to enter the estimate now.
+    def closures(self, time_ns: int) -> tuple[Closure, ...]:
+        """The closures that are to enter the estimate now, at ``time_ns``.
 
         One pair is compared at a time: in this process, where there is no second one, that delays
         the next scan.
@@ -195,7 +198,8 @@ class LoopCloser:
             if found is not None:
                 self._take(pair, found)
                 agreed = self._agreed()
-        if self._asked is None and self._waiting:
+        if self._asked is None and self._waiting and time_ns - self._asked_ns >= APART_NS:
+            self._asked_ns = time_ns
             pair = self._waiting.popleft()
             self._asked = pair, Future(lambda: verify_pairs([pair], along=True), urgent=False)
         return agreed

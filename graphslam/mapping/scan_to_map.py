@@ -249,8 +249,9 @@ class _Block:
         place_m: Array,
         spread: float,
     ) -> OnWalls:
-        scan = self._scan
-        config = replace(self._config, range_sigma_m=spread * self._config.range_sigma_m)
+        scan, config = self._scan, self._config
+        if spread != 1.0:
+            config = replace(config, range_sigma_m=spread * config.range_sigma_m)
         return returns_on_walls(
             self._near, world, transform_each(poses, self._lasers)[scan], self._walls, config,
             gate=gate, margin_m=0.0, heading_rad=heading_rad[scan], place_m=place_m[scan],

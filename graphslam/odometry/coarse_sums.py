@@ -10,7 +10,7 @@ import numpy as np
 from graphslam.core.geometry import Array, between
 from graphslam.core.motion_models import Increments
 from graphslam.core.record import replace
-from graphslam.odometry.increment_sums import IncrementSums, PathSums
+from graphslam.odometry.increment_sums import IncrementSums, Motions
 from graphslam.odometry.readings import IntArray
 
 if TYPE_CHECKING:
@@ -21,13 +21,15 @@ if TYPE_CHECKING:
 COARSE_M = 0.3
 
 
-def coarse_sums(track: "Track", begin: IntArray, end: IntArray, calibration: Array) -> PathSums:
-    """The base's path of a track between times (n,) of the odometry's clock, by parameters (n, p).
+def coarse_sums(track: "Track", begin: IntArray, end: IntArray, calibration: Array) -> Motions:
+    """The base's motions of a track between times (n,) of the odometry's clock.
 
-    Knots lie `COARSE_M` of effort apart, counted from each start; motions with the same start
-    share them.
+    By parameters (n, p). Knots lie `COARSE_M` of effort apart, counted from each start; motions
+    with the same start share them.
     """
-    effort_begin, effort_end = track.effort(begin), track.effort(end)
+    effort_begin, effort_end = track.effort(np.stack([begin, end]))
+    if np.all(effort_end <= effort_begin + COARSE_M):  # so are those of a live robot
+        return _motions(_piece(track, begin, end, calibration))
     _, group = np.unique(begin, return_inverse=True)
     passed = np.zeros(len(begin), dtype=np.int64)  # pieces before each end
     knot = begin.copy()  # the last one before each end
@@ -56,12 +58,18 @@ def coarse_sums(track: "Track", begin: IntArray, end: IntArray, calibration: Arr
         calibration[of],
     )
     sums = IncrementSums(whole, np.repeat(first, counts))
-    return sums.query(first[group] + passed, first[group], _piece(track, knot, end, calibration))
+    part = _piece(track, knot, end, calibration)
+    return sums.query(first[group] + passed, first[group], part).motions()
 
 
 def _piece(track: "Track", begin: IntArray, end: IntArray, calibration: Array) -> Increments:
     """Base motions between times (n,) of the odometry's clock, each as one increment."""
     part = track.increments(track.added_rows(begin, end), np.zeros(track.increment_parameters))
-    delta = between(track.pose(begin), track.pose(end))
+    delta = between(*track.pose(np.stack([begin, end])))
     delta = delta + np.einsum("nij,nj->ni", part.d_cal, calibration)
     return replace(part, delta=delta)
+
+
+def _motions(one: Increments) -> Motions:
+    """Motions of one increment each."""
+    return Motions(one.delta, one.cov, one.d_cal, np.hypot(one.delta[:, 0], one.delta[:, 1]))

@@ -305,14 +305,15 @@ class Track(Readings):
         if self.is_mounted:
             late = np.rint(1e9 * mean[:, p + 3]).astype(np.int64)
         begin, end = start_ns - late, end_ns - late
-        moved = coarse_sums(self, begin, end, mean[:, :p]).motions()
+        moved = coarse_sums(self, begin, end, mean[:, :p])
         delta, cov, d_cal = moved.delta, moved.cov, moved.d_cal
         if self.is_mounted:
             delta, cov, d_cal = of_mount(delta, cov, d_cal, mean[:, p : p + 3], None)
         used = d_cal.shape[2]
         cov = cov + d_cal @ cal_cov[:, :used, :used] @ d_cal.mT
         if self.source != "given":
-            drove = (self.effort(end) > self.effort(begin))[:, None, None]
+            effort_begin, effort_end = self.effort(np.stack([begin, end]))
+            drove = (effort_end > effort_begin)[:, None, None]
             cov = cov + np.where(drove, self.floor_cov_of(True), self.floor_cov_of(False))
         return delta, np.where((end_ns > start_ns)[:, None, None], cov, 0.0)
 

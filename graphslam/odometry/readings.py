@@ -31,6 +31,8 @@ MAX_BURST_SHARE = 0.01
 EDGE_NS = 500_000_000
 #: readings that wait for integration at most: each is an array until then
 MOST_PENDING = 50_000
+#: readings of one robot that are integrated one by one at most: arrays take longer for so few
+FEW = 4
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
 TURNING_EFFORT_M = 0.3
 
@@ -289,7 +291,8 @@ class Readings:
 
     def added_rows(self, start_ns: IntArray, end_ns: IntArray) -> Array:
         """Sums (n, k) of the rows between times (n,) and (n,), a share of those cut by a time."""
-        return (self._total(end_ns) - self._total(start_ns))[:, _ROW:]
+        start, end = self._total(np.stack([start_ns, end_ns]))
+        return np.asarray((end - start)[:, _ROW:])
 
     def rows_between(self, start_ns: int, end_ns: int) -> Array:
         """Rows (m, k) of the readings between two times, a share of those cut by a time."""
@@ -349,12 +352,14 @@ def integrate_pending(many: Iterable[Readings]) -> None:
             limits = one.config.max_speed_m_s, one.config.max_turn_rad_s
             alike[one.source, *limits].append(one)
     for group in alike.values():
-        if len(group) == 1 and len(group[0]._pending) == 1:  # the rule where each scan asks
+        if len(group) == 1 and len(group[0]._pending) <= FEW:  # the rule where each scan asks
             (one,) = group
-            n = one._integrated
-            row = one._row(one._pending.pop(), int(one._times[n] - one._times[n - 1]))
-            one._integrated = one._count
-            one._enter(n, row)
+            for value in one._pending:
+                n = one._integrated
+                row = one._row(value, int(one._times[n] - one._times[n - 1]))
+                one._enter(n, row)
+                one._integrated = n + 1
+            one._pending.clear()
         else:
             _integrate(group)
 

@@ -1,5 +1,6 @@
 """What a pass accumulates for one robot, and the trajectories made of it."""
 
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -151,19 +152,21 @@ class RobotState:
         ``laser`` (n, 3): mounts of the sensors whose poses are asked for, if the robot has scans;
         ``start`` and ``away_m``: see `causal`; without ``start`` the world is that of the states.
         """
-        poses = np.array(self.causal_poses) - np.array([away_m, 0.0, 0.0])
-        known = Trajectory(np.array(self.times, dtype=np.int64), poses, np.array(self.causal_covs))
+        begin = max(bisect_right(self.times, int(times.min(initial=self.state_ns))) - 1, 0)
+        poses = np.array(self.causal_poses[begin:]) - np.array([away_m, 0.0, 0.0])
+        at, covs = np.array(self.times[begin:], dtype=np.int64), np.array(self.causal_covs[begin:])
+        known, calibrations = Trajectory(at, poses, covs), self.calibrations[begin:]
         # mount and latency as known then, for the base pose and for the frame that starts at it
         last = known.index_before(times)
         if not self.scans:
-            late_ns = np.array([self.track.reported_late_ns(c) for c in self.calibrations])
+            late_ns = np.array([self.track.reported_late_ns(c) for c in calibrations])
             times = times + late_ns[last]
         better = None
         if self.since_keyframe is not None:
             self.since_keyframe.match(self.track)
             better = self.since_keyframe.at(times, known.stamps_ns[last])
-        causal = causal_at(known, last, self.calibrations, self.track, times, stamps, better)
-        mount = np.array([self.track.mount_of(c) for c in self.calibrations])[last]
+        causal = causal_at(known, last, calibrations, self.track, times, stamps, better)
+        mount = np.array([self.track.mount_of(c) for c in calibrations])[last]
         if start is not None:
             causal = transform_trajectory(causal, origin_shift(start, mount))
         scan = trajectory_of_mount(causal, laser) if self.scans else None

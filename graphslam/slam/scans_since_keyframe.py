@@ -8,6 +8,7 @@ whole map (`scans_between`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from statistics import median
 
 import numpy as np
 
@@ -37,8 +38,8 @@ SHARES = 100
 class ScansSinceKeyframe:
     """The scans of one robot since its last keyframe, and where they were found, seen from it.
 
-    ``state_ns``: time of the keyframe; ``calibration`` of the odometry, known then; ``walls`` poses
-    (n, 3) and ``extents`` (n, 2) m of what it saw, in its frame. ``times`` and ``states`` ns,
+    ``state_ns``: time of the keyframe; ``calibration`` of the odometry, known then; ``walls`` that
+    it saw, in its frame, None if it saw none. ``times`` and ``states`` ns,
     ``poses`` (3,) and ``covs`` (3, 3) along the axes of the keyframe, of the scans that were
     matched. ``variances`` (3,): factors on the variances of odometry; ``counted``: from how many
     scans; ``shares``: of their returns on walls. ``unused``: both of the scans since the keyframe,
@@ -48,8 +49,7 @@ class ScansSinceKeyframe:
     config: FrontEndConfig
     calibration: Calibration
     state_ns: int = -1
-    walls: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    extents: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    walls: WallTree | None = None
     held: list[Scan] = field(default_factory=list)
     times: list[int] = field(default_factory=list)
     states: list[int] = field(default_factory=list)
@@ -86,12 +86,12 @@ class ScansSinceKeyframe:
         self.variances, self.unused = np.maximum(self.variances, 1.0), []
         walls = [o for o in seen if o.extent is not None]
         self.state_ns = state_ns
-        self.walls = np.array([o.z for o in walls]).reshape(-1, 3)
-        self.extents = np.array([o.extent for o in walls]).reshape(-1, 2)
+        means, extents = (np.array(v) for v in ([o.z for o in walls], [o.extent for o in walls]))
+        self.walls = WallTree.from_walls(means, extents) if walls else None
 
     def add(self, scan: Scan, track: Track) -> None:
         """A scan that gets no state."""
-        if len(self.walls) and any(track.moved(self.state_ns, scan.time_ns)):
+        if self.walls is not None and any(track.moved(self.state_ns, scan.time_ns)):
             self.held.append(thinned(scan, BEAMS))
             if len(self.held) >= MOST_HELD:
                 self.match(track)
@@ -99,7 +99,7 @@ class ScansSinceKeyframe:
     def match(self, track: Track) -> None:
         """Find out where the scans were that came since this was asked last."""
         held, self.held = self.held, []
-        if not held:
+        if not held or self.walls is None:
             return
         at = np.array([scan.time_ns for scan in held], dtype=np.int64)
         first = np.zeros(len(at), dtype=np.int64)
@@ -107,9 +107,8 @@ class ScansSinceKeyframe:
         prior, noise = track.coarse_motions(begin, at, [self.calibration], first)
         covs = rotate_cov(noise, -prior[:, 2]) + TINY
         sigmas = np.sqrt(self.variances)
-        tree = WallTree.from_walls(self.walls, self.extents)
         found = fit_to_walls(
-            prior, sigmas[:, None] * covs * sigmas, _returns(held, self.config), tree, self.config
+            prior, sigmas[:, None] * covs * sigmas, _returns(held, self.config), self.walls, self.config
         )
         # what odometry is off by, and what is not known of that
         squared = between(prior, found.poses) ** 2 + np.diagonal(found.covs, axis1=1, axis2=2)
@@ -126,7 +125,7 @@ class ScansSinceKeyframe:
 
     def _is_found(self, share: float) -> bool:
         """Whether a scan of which a share of returns is on walls has found its place."""
-        return share > 0 and share >= LEAST_SHARE * float(np.median(self.shares or [0.0]))
+        return share > 0 and share >= LEAST_SHARE * median(self.shares or [0.0])
 
     def at(self, times_ns: IntArray, states_ns: IntArray) -> tuple[IntArray, Array, Array]:
         """Of scans (n,) after states (n,): rows (m,), poses (m, 3) seen from the state, covs."""

@@ -39,7 +39,7 @@ def lived(true, turned_per_m, walls=L_ROOM, closes=True):
         points = cloud(pose, walls).astype(np.float32)
         if closes:
             closer.add([KeyframeScan("robot", k * S, points)])
-            found = closer.closures()
+            found = closer.closures(k * S)
             if found:
                 backend.add(Step(k * S, closures=found))
                 closures.append(found)
@@ -109,7 +109,7 @@ def test_where_nothing_is_in_reach_there_is_no_place():
         motion = Motion((k - 1) * S, k * S, ahead, COV, np.zeros((3, 0)), 0.25)
         backend.add(Step(k * S, motions={"robot": motion}))
         closer.add([KeyframeScan("robot", k * S, np.zeros((0, 2), dtype=np.float32))])
-        assert closer.closures() == ()
+        assert closer.closures(k * S) == ()
         backend.forget()
     assert len(backend.builder.kept) <= 3  # of the last metres, not judged yet
 

@@ -108,7 +108,7 @@ class OneClosure:
     def add(self, scans):
         self.states += [(scan.robot, scan.time_ns) for scan in scans]
 
-    def closures(self):
+    def closures(self, _time_ns):
         if self.is_done or len(self.states) < 20:
             return ()
         self.is_done = True
