@@ -80,8 +80,10 @@ def follow(
         folder = _Folder(target, before, session, log)
         state = "ended"
         try:
-            messages = _messages(growing, log, file, chosen, folder)
-            for estimate in session.process_sorted(messages):
+            logs = replace(chosen.logs, reorder_s=chosen.live.reorder_s)
+            reader = FileReader(file, replace(chosen, logs=logs))
+            messages = _messages(growing, log, reader, chosen, folder)
+            for estimate in session.process_sorted(messages, reader.sorter.ready):
                 folder.history.add(estimate)
                 each(estimate)
                 folder.write_if_due()
@@ -132,7 +134,7 @@ def _opened(
 
 
 def _messages(
-    growing: GrowingMcap, log: LogSet, file: Recording, config: Config, folder: "_Folder"
+    growing: GrowingMcap, log: LogSet, reader: FileReader, config: Config, folder: "_Folder"
 ) -> Iterator[Message]:
     """The messages of the recording, sorted by time, as they come."""
     topics = {topic.name: topic for topic in log.topics}
@@ -147,8 +149,6 @@ def _messages(
             raws = [raw for message in batch for raw in used(message)]
             yield from decoded(raws, topics, contexts, folder.dropped)
 
-    logs = replace(config.logs, reorder_s=config.live.reorder_s)
-    reader = FileReader(file, replace(config, logs=logs))
     folder.sorter = reader.sorter
     yield from with_whole_turns(reader.sorted(recorded()), log.wrapped, folder.repaired)
     for counts in reader.sorter.counts.values():

@@ -3,7 +3,7 @@
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import Any
@@ -149,10 +149,20 @@ class Session:
             first, kinds = introduced(rest)
             self._log = expected_log(kinds, self.config)
             rest = chain(first, rest)
-        yield from self.process_sorted(self._sorted(self._expected(rest)))
+        # messages come in any order, and what comes late says nothing of the stamps of the others
+        sorter = MessageSorter(round(1e9 * self.config.live.reorder_s), repair=False)
+        self._sorter = sorter
+        in_order = _sorted(self._expected(rest), sorter, self._unused)
+        yield from self.process_sorted(in_order, sorter.ready)
 
-    def process_sorted(self, messages: Iterable[Message]) -> Iterator[LiveEstimate]:
-        """As `process`, for messages that are sorted by ``time_ns``, of robots that are known.
+    def process_sorted(
+        self, messages: Iterable[Message], ready: Collection[Message] = ()
+    ) -> Iterator[LiveEstimate]:
+        """As `process`, for messages of robots that are known.
+
+        Args:
+            messages: sorted by ``time_ns``.
+            ready: those that come next without any waiting, at each time.
 
         Raises:
             LogError, ConfigError, EstimationError: as `process`.
@@ -165,7 +175,7 @@ class Session:
             )
         check_robots(self._log, self.config)
         self._pass = LivePass(self._log, self.config, known_starts(self._log, self.config))
-        yield from self._pass.estimates(messages)
+        yield from self._pass.estimates(messages, ready)
 
     def _records(self, messages: Iterable[Message]) -> Iterator[Message]:
         """What is a message at all."""
@@ -193,13 +203,13 @@ class Session:
             else:
                 yield usable
 
-    def _sorted(self, messages: Iterable[Message]) -> Iterator[Message]:
-        # messages come in any order, and what comes late says nothing of the stamps of the others
-        sorter = MessageSorter(round(1e9 * self.config.live.reorder_s), repair=False)
-        self._sorter = sorter
-        for message in without_leaps(messages, self._unused):
-            yield from sorter.push(f"{message.robot} {type(message).__name__}", message)
-        yield from sorter.finish()
+
+def _sorted(
+    messages: Iterable[Message], sorter: MessageSorter, dropped: Counter[str]
+) -> Iterator[Message]:
+    for message in without_leaps(messages, dropped):
+        yield from sorter.push(f"{message.robot} {type(message).__name__}", message)
+    yield from sorter.finish()
 
 
 def _names_records(robots: object) -> bool:

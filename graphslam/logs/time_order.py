@@ -81,6 +81,7 @@ class MessageSorter:
 
     Attributes:
         counts: per topic, how many were `GLITCH`, `DUPLICATE` (kept) and of each of `DROPPED`.
+        ready: messages that follow the one that was passed on last, whatever is pushed next.
     """
 
     def __init__(self, window_ns: int, *, repair: bool = True) -> None:
@@ -89,6 +90,7 @@ class MessageSorter:
         Without ``repair`` stamps are taken for true, and the order tells when messages came.
         """
         self.counts: dict[str, Counter[str]] = {}
+        self.ready: deque[Message] = deque()
         self._repair = repair
         self._window_ns = window_ns
         self._repairs: dict[str, _GlitchRepair] = {}
@@ -155,7 +157,9 @@ class MessageSorter:
             elif isinstance(message, records.Sighting) and self._is_repeated(message):
                 self.counts[topic][REPEATED_SIGHTING] += 1
                 continue
-            yield message
+            self.ready.append(message)
+        while self.ready:
+            yield self.ready.popleft()
 
     def _is_repeated(self, message: records.Sighting) -> bool:
         """Whether the same was seen at the same time already: recordings that were put together."""

@@ -108,7 +108,11 @@ class ScansSinceKeyframe:
         covs = rotate_cov(noise, -prior[:, 2]) + TINY
         sigmas = np.sqrt(self.variances)
         found = fit_to_walls(
-            prior, sigmas[:, None] * covs * sigmas, _returns(held, self.config), self.walls, self.config
+            prior,
+            sigmas[:, None] * covs * sigmas,
+            _returns(held, self.config),
+            self.walls,
+            self.config,
         )
         # what odometry is off by, and what is not known of that
         squared = between(prior, found.poses) ** 2 + np.diagonal(found.covs, axis1=1, axis2=2)
