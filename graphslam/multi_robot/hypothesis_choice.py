@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from graphslam.core.config import MultiRobotConfig
+from graphslam.core.config import LoopClosureConfig, MultiRobotConfig
 from graphslam.core.consistency import has_rival
 from graphslam.core.geometry import between
 from graphslam.core.record import replace
 from graphslam.mapping.submaps import SubmapPose
-from graphslam.multi_robot.map_localisation import Support
+from graphslam.multi_robot.map_localisation import Support, self_contradictions
 from graphslam.multi_robot.place_recognition import EQUIVALENT_SHARE, MIN_MATCHES, extent
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 
@@ -21,6 +21,9 @@ from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 #: in the simulated office that were placed right 23 had none, one 0.19; of those in a part that
 #: only looks alike 0.2 to 0.3
 DOUBT_SHARE, LEAST_DOUBTED = 0.2, 2
+#: a place contradicts a map by this factor more than places seen again usually do; of how many of
+#: these at least that is known
+USUAL_FACTOR, LEAST_USUAL = 1.5, 4
 #: share of the best one's support from which another hypothesis is a rival whatever contradicts it;
 #: others are from half of it on, unless they are contradicted
 EQUAL_SHARE = 0.7
@@ -90,18 +93,36 @@ def contradiction(given: Support) -> str:
     return f"{against} of {len(given.confirmed)} places contradict it, {agreeing} agree with it"
 
 
-def doubt(placed: Support) -> str:
+def doubt(placed: Support, places: Sequence[SubmapPose], config: LoopClosureConfig) -> str:
     """What is to be said of a path that is placed in a map; empty if hardly anything is against it.
 
-    Things that were moved contradict the right place too, so it is no reason to refuse it.
+    Things that were moved contradict the right place too, so it is no reason to refuse it. No doubt
+    is a place that contradicts the map by no more than places of the path contradict each other.
+
+    Args:
+        placed: how the places agree.
+        places: by the path itself.
+        config: settings of submaps.
     """
-    against = int(placed.contradicted.sum())
-    if against < LEAST_DOUBTED or placed.contradicted_share <= DOUBT_SHARE:
+    count = len(placed.contradicted)
+    against = _doubted(placed, 0.0)
+    if against:
+        usual = self_contradictions(places, 2.0 * config.submap_reach_m)
+        if len(usual) >= LEAST_USUAL:
+            against = _doubted(placed, USUAL_FACTOR * float(np.median(usual)))
+    if not against:
         return ""
     return (
-        f"{against} of {len(placed.contradicted)} places contradict where it was placed: much was "
-        "moved, or it drove elsewhere, where it looks alike"
+        f"{against} of {count} places contradict where it was placed: much was moved, or it drove "
+        "elsewhere, where it looks alike"
     )
+
+
+def _doubted(placed: Support, least: float) -> int:
+    """How many places contradict by more than a share ``least``, 0 where these are few."""
+    against = int((placed.contradicted & (placed.absent > least)).sum())
+    few = max(LEAST_DOUBTED - 1, DOUBT_SHARE * int(placed.confirmed.sum()))
+    return against if against > few else 0
 
 
 def differ(one: Support, other: Support) -> bool:

@@ -59,13 +59,14 @@ class Support:
 
     A score (n,) is the share of a place's points that the map confirms less the weighted share
     that is in free space; 0 for places where the map has nothing, or that are not confirmed.
-    ``poses`` (n, 3): where the places are laid.
+    ``poses`` (n, 3): where the places are laid. ``absent`` (n,): the share that contradicts.
     """
 
     poses: Array
     scores: Array
     confirmed: BoolArray
     contradicted: BoolArray
+    absent: Array
 
     @property
     def total(self) -> float:
@@ -114,34 +115,58 @@ def hypotheses(known: PlaceMap, own: PlaceMap, config: MultiRobotConfig) -> list
 def support(known: Sequence[SubmapPose], places: Sequence[SubmapPose]) -> Support:
     """How well places (n), laid into the map as a hypothesis says, agree with its places."""
     n = len(places)
-    scores, confirmed, contradicted = np.zeros(n), [False] * n, [False] * n
-    positions = np.array([p.pose[:2] for p in known])
+    beside, same, absent = _agreements(known, places, np.ones((n, len(known)), dtype=bool))
+    confirmed, of_all = np.zeros(n, dtype=bool), np.zeros((2, n))
+    confirmed[beside] = same >= MIN_CONFIRMED
+    of_all[:, beside] = same, absent
+    scores = np.where(confirmed, np.maximum(of_all[0] - ABSENT_WEIGHT * of_all[1], 0.0), 0.0)
+    poses = np.array([p.pose for p in places])
+    return Support(poses, scores, confirmed, of_all[1] > MAX_ABSENT_SHARE, of_all[1])
+
+
+def self_contradictions(places: Sequence[SubmapPose], apart_m: float) -> Array:
+    """Share that contradicts free space of each place (m,) that the same path passes again.
+
+    Legs of tables, glass and people contradict the right place too.
+
+    Args:
+        places: of one path, as estimated.
+        apart_m: path between two visits, at least.
+    """
+    path_m = np.array([place.path_m for place in places])
+    apart = np.abs(path_m[:, None] - path_m) >= apart_m
+    return _agreements(places, places, apart)[2]
+
+
+def _agreements(
+    known: Sequence[SubmapPose], places: Sequence[SubmapPose], allowed: BoolArray
+) -> tuple[list[int], Array, Array]:
+    """Which places lie among known ones, m of them, and the shares (m,) of `_agreement`.
+
+    ``allowed`` (n, number of ``known``): which of these a place is compared with.
+    """
+    positions = np.array([p.pose[:2] for p in known]).reshape(-1, 2)
     beside: list[int] = []
     around: list[Submap] = []
     guesses: list[Array] = []
     for k, place in enumerate(places):
-        distance = np.hypot(*(positions - place.pose[:2]).T)
-        nearest = int(distance.argmin())
-        if distance[nearest] < AROUND_M / 2:
+        distance = np.where(allowed[k], np.hypot(*(positions - place.pose[:2]).T), np.inf)
+        nearest = int(distance.argmin()) if len(distance) else 0
+        if len(distance) and distance[nearest] < AROUND_M / 2:
             beside.append(k)
             origin = known[nearest].pose
-            around.append(
-                surroundings(
-                    [known[j] for j in np.flatnonzero(distance < AROUND_M).tolist()], origin
-                )
-            )
+            near = np.flatnonzero(distance < AROUND_M).tolist()
+            around.append(surroundings([known[j] for j in near], origin))
             guesses.append(between(origin, place.pose))
     aligned, _, _ = align_pairs([places[k].submap for k in beside], around, guesses)
-    for k, target, guess, pose in zip(beside, around, guesses, aligned, strict=True):
+    shares = np.zeros((2, len(beside)))
+    for n, (k, target, guess, pose) in enumerate(
+        zip(beside, around, guesses, aligned, strict=True)
+    ):
         off = between(guess, pose)
         at = pose if np.hypot(off[0], off[1]) < OFF_M and abs(off[2]) < OFF_RAD else guess
-        same, absent = _agreement(places[k].submap, target, at)
-        confirmed[k] = same >= MIN_CONFIRMED
-        contradicted[k] = absent > MAX_ABSENT_SHARE
-        scores[k] = max(same - ABSENT_WEIGHT * absent, 0.0) if confirmed[k] else 0.0
-    return Support(
-        np.array([p.pose for p in places]), scores, np.array(confirmed), np.array(contradicted)
-    )
+        shares[:, n] = _agreement(places[k].submap, target, at)
+    return beside, shares[0], shares[1]
 
 
 def surroundings(places: Sequence[SubmapPose], origin: Array) -> Submap:

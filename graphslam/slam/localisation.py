@@ -5,6 +5,8 @@ match in several places and imply one relative pose, without a rival (`multi_rob
 does not tell is refused.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphslam.core.config import Config
@@ -16,7 +18,7 @@ from graphslam.core.record import replace
 from graphslam.core.records import Start
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.loop_closure import Tamper
-from graphslam.mapping.submaps import submaps_at, with_poses_from
+from graphslam.mapping.submaps import SubmapPose, submaps_at, with_poses_from
 from graphslam.multi_robot.hypothesis_choice import best_explanation, contradiction, doubt
 from graphslam.multi_robot.map_localisation import Support, hypotheses, support
 from graphslam.multi_robot.place_recognition import PlaceMap
@@ -87,8 +89,8 @@ def start_as_given(
     is_wrong = is_contradicted(given, laid, robot)
     if is_wrong:  # pulled to what was told, the beginning of the path is torn
         laid = laid_into(scan_log, robot, laid_start(laid, robot), known_map, tamper)
-    placed = check_given(scan_log, robot, laid, known_map)
-    said = doubt(placed)
+    placed, places = check_given(scan_log, robot, laid, known_map)
+    said = doubt(placed, places, scan_log.config.loop_closure)
     if is_wrong:
         off = between(given.pose, laid.states[robot].poses[0])
         what = f"{np.hypot(off[0], off[1]):.2f} m and {np.degrees(abs(off[2])):.1f}°"
@@ -114,8 +116,10 @@ def is_contradicted(given: Start, laid: ClosedPaths, robot: str) -> bool:
     return bool(((axes.T @ off)[told] ** 2 / values[told]).sum() > START_GATE)
 
 
-def check_given(scan_log: ScanLog, robot: str, laid: ClosedPaths, known_map: KnownMap) -> Support:
-    """How well a path that was ``laid`` from a start that was given explains its places.
+def check_given(
+    scan_log: ScanLog, robot: str, laid: ClosedPaths, known_map: KnownMap
+) -> tuple[Support, Sequence[SubmapPose]]:
+    """How well a path that was ``laid`` from a given start explains its places, and these.
 
     Raises:
         EstimationError: from there the log sees something else than the map.
@@ -129,7 +133,7 @@ def check_given(scan_log: ScanLog, robot: str, laid: ClosedPaths, known_map: Kno
             f"robot {robot}: does not begin in the map {known_map.name} where --start says: {why}; "
             "give another map, or another start"
         )
-    return placed
+    return placed, submaps
 
 
 def found_start(
@@ -152,7 +156,7 @@ def found_start(
     if supports:
         best, why = best_explanation(supports, own.places, scan_log.config.multi_robot)
         if not why:
-            scan_log.map_doubt = doubt(supports[best])
+            scan_log.map_doubt = doubt(supports[best], own.places, scan_log.config.loop_closure)
             return found[best]
     raise EstimationError(
         f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; give "

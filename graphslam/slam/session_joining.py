@@ -95,13 +95,14 @@ def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"])
         known = _group(before, sessions).map
         if known.places:
             placed = _lay({name: start}, known, sessions).support
+            own = sessions[name]
             why = contradiction(placed)
             if why:
                 raise EstimationError(
                     f"session {name}: --start contradicts that of {', '.join(before)}: {why}; "
                     "give another start, or none"
                 )
-            if said := doubt(placed):
+            if said := doubt(placed, own.own.places, own.log.config.loop_closure):
                 doubted[name] = said
         before[name] = start
     return doubted
@@ -221,12 +222,9 @@ def _joined(
     if why:
         return why
     remarks = {**one.remarks, **other.remarks}
-    if best.support.is_contradicted:
-        against = int(best.support.contradicted.sum())
-        said = f"{against} of {len(places)} places contradict where it was placed, "
-        said += "but nothing else explains them: much was moved"
-        remarks |= dict.fromkeys(best.starts, said)
-    elif said := doubt(best.support):
+    if said := doubt(best.support, best.places, config.loop_closure):
+        if best.support.is_contradicted:
+            said = f"{said.split(':')[0]}, but nothing else explains them: much was moved"
         remarks |= dict.fromkeys(best.starts, said)
     return _Group(
         {**one.starts, **best.starts},

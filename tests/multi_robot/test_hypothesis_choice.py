@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from graphslam.core.config import MultiRobotConfig
+from graphslam.core.config import LoopClosureConfig, MultiRobotConfig
 from graphslam.multi_robot.hypothesis_choice import best_explanation, choose, contradiction, doubt
 from graphslam.multi_robot.map_localisation import Support
 
@@ -22,6 +22,7 @@ def hypothesis(score, contradicted, shift_m=0.0):
         np.full(6, score),
         np.ones(6, bool),
         np.arange(6) < contradicted,
+        0.1 * (np.arange(6) < contradicted),
     )
 
 
@@ -69,7 +70,9 @@ def test_a_place_that_some_contradict_is_a_doubt_and_one_thing_that_moved_is_non
 ):
     yes = np.arange(18) < confirmed
     no = np.arange(18) >= 18 - against
-    said = doubt(Support(np.zeros((18, 3)), np.ones(18), yes, no))
+    said = doubt(
+        Support(np.zeros((18, 3)), np.ones(18), yes, no, 0.1 * no), [], LoopClosureConfig()
+    )
     assert bool(said) == is_doubted
     assert not said or said.startswith(f"{against} of 18 places contradict")
 
@@ -94,7 +97,7 @@ def laid(scores, shift_m=0.0, contradicted=0):
     """A hypothesis whose places have scores (12,); where they are 0, the map has nothing."""
     scores = np.array(scores, dtype=float)
     off = np.array([shift_m, 0.0, 0.0])
-    return Support(LONG + off, scores, scores > 0, np.arange(12) < contradicted)
+    return Support(LONG + off, scores, scores > 0, np.arange(12) < contradicted, np.zeros(12))
 
 
 RIGHT = laid([0.8] * 8 + [0] * 4)
@@ -141,7 +144,9 @@ def test_much_may_have_been_moved_where_nothing_else_explains_anything():
     for found in ([moved, less_faint], [laid([0.4] * 8 + [0] * 4, contradicted=6)]):
         assert "places contradict it" in best_explanation(found, LONG_PLACES, CONFIG)[1]
     # where all are contradicted nothing is explained, and the right pose may be as contradicted
-    nothing = Support(LONG, np.zeros(12), np.ones(12, dtype=bool), np.ones(12, dtype=bool))
+    nothing = Support(
+        LONG, np.zeros(12), np.ones(12, dtype=bool), np.ones(12, dtype=bool), np.zeros(12)
+    )
     turned = replace(nothing, poses=np.add(LONG, [20.0, 0, 0]), confirmed=np.arange(12) < 7)
     for found in ([nothing], [moved, turned]):
         assert "places contradict it" in best_explanation(found, LONG_PLACES, CONFIG)[1]
