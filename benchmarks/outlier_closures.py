@@ -22,7 +22,7 @@ from common import DATA, parser, pose_graph_values, smooth_log
 
 from graphslam.core.records import Result
 from graphslam.logs import IMPORTERS, pose_stamp_ns
-from graphslam.logs.import_pose_graph import Edge, read_pose_graph, split_odometry
+from graphslam.logs.import_pose_graph import PoseGraphEdge, read_pose_graph, split_odometry
 
 PRIOR_SIGMA = 1e-3
 #: the graph without false closures; one robot with them; two robots with them, and without
@@ -42,7 +42,7 @@ def smoothed(sources: list[Path]) -> Result:
         return smooth_log(log)
 
 
-def ends(edge: Edge) -> tuple[int, int]:
+def ends(edge: PoseGraphEdge) -> tuple[int, int]:
     """Stamps of a closure's ends, the earlier first."""
     a, b = sorted((edge.start, edge.end))
     return pose_stamp_ns(a), pose_stamp_ns(b)

@@ -12,7 +12,7 @@ import numpy as np
 
 from graphslam.change_detection.beam_evidence import (
     DOUBTFUL_SIGMA,
-    Evidence,
+    BeamEvidence,
     agreeing_share,
     beams_past_surfaces,
     half_beam_spacing,
@@ -78,7 +78,7 @@ class AlignedVisits:
     registration: Registration
     surfaces: tuple[Surface, Surface]
     range_sigmas_m: tuple[float, float]
-    evidence: tuple[Evidence, Evidence]
+    evidence: tuple[BeamEvidence, BeamEvidence]
     config: ChangesConfig
     nonrigid: bool
     rivals: tuple[tuple[Array, float], ...] = ()
@@ -250,7 +250,7 @@ def _evidence(
     surfaces: tuple[Surface, Surface],
     sigmas: tuple[float, float],
     config: ChangesConfig,
-) -> tuple[Evidence, Evidence]:
+) -> tuple[BeamEvidence, BeamEvidence]:
     """Evidence of later beams on reference surfaces, of reference beams on later surfaces."""
     return (
         beams_past_surfaces(surfaces[0], visits[1], sigmas[1], config),
@@ -258,7 +258,7 @@ def _evidence(
     )
 
 
-def _share_elsewhere(evidence: tuple[Evidence, ...]) -> float:
+def _share_elsewhere(evidence: tuple[BeamEvidence, ...]) -> float:
     """Share of the surface that both visits saw which is elsewhere in the other."""
     scores = np.concatenate([e.scores(1.0)[e.tested] for e in evidence])
     return float(np.mean(np.abs(scores) > _ELSEWHERE_SIGMAS)) if len(scores) else 1.0

@@ -47,7 +47,7 @@ _CHUNK = 400_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class BeamEvidence:
     """Test statistics of the beams of one visit on each piece of the other's surfaces.
 
     Attributes:
@@ -78,7 +78,7 @@ class Evidence:
 
 def beams_past_surfaces(
     surface: Surface, visit: Visit, sigma_m: float, config: ChangesConfig
-) -> Evidence:
+) -> BeamEvidence:
     """Evidence of the beams of ``visit``, of range noise ``sigma_m``, on the other's surfaces."""
     used = np.nonzero(visit.surface & (visit.range_m <= config.max_range_m))[0]
     ends, directions = visit.ends_of(used), visit.directions[used]
@@ -121,7 +121,7 @@ def beams_past_surfaces(
     padded = np.concatenate([hit, [never]])
     hit = np.min([padded[rows] for rows in inner], axis=0)
     first = np.where(first == never, hit, first)
-    return Evidence(beam, row, mean, variance, count, through, tested, first)
+    return BeamEvidence(beam, row, mean, variance, count, through, tested, first)
 
 
 def inner_windows(surface: Surface) -> list[Ints]:
@@ -226,7 +226,7 @@ def range_noise(surface: Surface, visit: Visit, config: ChangesConfig) -> float:
     return float(np.median(np.abs(e[face_on] / cosine[face_on])) / norm.ppf(0.75))
 
 
-def null_sigma(evidence: tuple[Evidence, ...]) -> float:
+def null_sigma(evidence: tuple[BeamEvidence, ...]) -> float:
     """Sigma of the scores without a change: 1 if all covariances are as stated.
 
     Most of what is observed has not changed, so the bulk of the scores has the null distribution
@@ -251,7 +251,7 @@ def null_sigma(evidence: tuple[Evidence, ...]) -> float:
     return max(_TAILS * sigma, _MIN_SIGMA)
 
 
-def agreeing_share(evidence: tuple[Evidence, ...], sigmas: float, per_beam: bool) -> float:
+def agreeing_share(evidence: tuple[BeamEvidence, ...], sigmas: float, per_beam: bool) -> float:
     """Share of the tested pieces whose offset is within ``sigmas`` of the stated one; or of beams.
 
     1 if nothing was tested.
@@ -262,7 +262,7 @@ def agreeing_share(evidence: tuple[Evidence, ...], sigmas: float, per_beam: bool
     return float(np.average(np.abs(scores) <= sigmas, weights=weight if per_beam else None))
 
 
-def repeatability(evidence: tuple[Evidence, ...]) -> float:
+def repeatability(evidence: tuple[BeamEvidence, ...]) -> float:
     """Sigma, m, of the offsets between two visits of what did not change, from the median.
 
     It includes what the covariances leave out: bias of other materials that affected the alignment
@@ -272,7 +272,7 @@ def repeatability(evidence: tuple[Evidence, ...]) -> float:
     return _robust_sigma(offsets, _tested_scores(evidence)[1], 0.5) if len(offsets) else 0.0
 
 
-def _tested_scores(evidence: tuple[Evidence, ...]) -> tuple[Array, Array]:
+def _tested_scores(evidence: tuple[BeamEvidence, ...]) -> tuple[Array, Array]:
     """Scores (k,), for a sigma of 1, of all tested pieces, and their numbers of beams (k,)."""
     scores = np.concatenate([e.scores(1.0)[e.tested] for e in evidence])
     return scores, np.concatenate([e.count[e.tested] for e in evidence])

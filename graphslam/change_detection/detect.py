@@ -19,7 +19,7 @@ from graphslam.change_detection.alignment import (
     laser_warnings,
     settings_for_noise,
 )
-from graphslam.change_detection.beam_evidence import Evidence, null_sigma, repeatability
+from graphslam.change_detection.beam_evidence import BeamEvidence, null_sigma, repeatability
 from graphslam.change_detection.objects import (
     Change,
     Lines,
@@ -67,7 +67,7 @@ class ChangeResult:
     reference: Visit
     later: Visit
     surfaces: tuple[Surface, Surface]
-    evidence: tuple[Evidence, Evidence]
+    evidence: tuple[BeamEvidence, BeamEvidence]
     compared: Bools
     flagged: Bools
     null_sigma: float
@@ -155,7 +155,7 @@ def detect_changes(
 def _classify_beams(
     later: Visit,
     surface: Surface,
-    evidence: tuple[Evidence, Evidence],
+    evidence: tuple[BeamEvidence, BeamEvidence],
     sigma: float,
     config: ChangesConfig,
 ) -> tuple[Bools, Bools]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.stats import norm
 
-from graphslam.change_detection.beam_evidence import DOUBTFUL_SIGMA, Evidence
+from graphslam.change_detection.beam_evidence import DOUBTFUL_SIGMA, BeamEvidence
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.surface_map import WINDOW, Surface
 from graphslam.change_detection.visit import Bools, Ints
@@ -34,7 +34,7 @@ class Region:
     first_ns: int
 
 
-def flag_pieces(evidence: Evidence, sigma: float, rate: float) -> Bools:
+def flag_pieces(evidence: BeamEvidence, sigma: float, rate: float) -> Bools:
     """Which pieces (n,) a one-sided test of false-alarm ``rate`` rejects as unchanged.
 
     ``sigma``: see `graphslam.change_detection.beam_evidence.null_sigma`.
@@ -44,7 +44,7 @@ def flag_pieces(evidence: Evidence, sigma: float, rate: float) -> Bools:
 
 def find_regions(
     surface: Surface,
-    evidence: Evidence,
+    evidence: BeamEvidence,
     beams: Ints,
     beam_rows: Ints,
     first_ns: Ints,

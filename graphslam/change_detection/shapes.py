@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from graphslam.change_detection.beam_evidence import MIN_COSINE, Evidence, half_beam_spacing
+from graphslam.change_detection.beam_evidence import MIN_COSINE, BeamEvidence, half_beam_spacing
 from graphslam.change_detection.grid import row_sums
 from graphslam.change_detection.regions import connected_components
 from graphslam.change_detection.surface_map import Surface
@@ -78,7 +78,7 @@ class Shape:
 
 
 def extract_shape(
-    surface: Surface, visit: Visit, evidence: Evidence, sigma: float, core: Array
+    surface: Surface, visit: Visit, evidence: BeamEvidence, sigma: float, core: Array
 ) -> Shape | None:
     """The visit's surface connected to a changed region that the other visit does not confirm.
 

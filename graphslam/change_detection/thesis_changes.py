@@ -21,7 +21,7 @@ from graphslam.change_detection.detect import identity_registration
 from graphslam.change_detection.grid import Grid, grid_over
 from graphslam.change_detection.rigid_registration import Registration, landmarks_of_map, register
 from graphslam.change_detection.thesis_method import (
-    Comparison,
+    BeamComparison,
     DentMap,
     LaserNoise,
     compare_scan,
@@ -79,7 +79,7 @@ class ThesisChanges:
     registration: Registration
     nearest: Ints
     grid: Grid
-    expected: Comparison
+    expected: BeamComparison
     marked: Bools
     regions: tuple[MarkedRegion, ...]
     gate: float
@@ -143,7 +143,7 @@ def thesis_changes(
         )
         parts.append(one)
         marked.append(consecutive_runs(one.differs(gate), config.consecutive_beams))
-    expected = Comparison.joined(parts)
+    expected = BeamComparison.joined(parts)
     every_marked = np.concatenate(marked)
     regions = marked_regions(later, expected, every_marked, grid)
     return ThesisChanges(
@@ -191,7 +191,7 @@ def _usable(ranges: Array, config: ChangesConfig) -> Array:
 
 
 def marked_regions(
-    later: Visit, expected: Comparison, marked: Bools, grid: Grid
+    later: Visit, expected: BeamComparison, marked: Bools, grid: Grid
 ) -> tuple[MarkedRegion, ...]:
     """Marked points in groups: of cells that are nearer to each other than `REGION_M`."""
     beams = np.flatnonzero(marked)
@@ -206,7 +206,7 @@ def marked_regions(
     return tuple(sorted(found, key=lambda region: -region.beams))
 
 
-def _region(later: Visit, expected: Comparison, beams: Ints) -> MarkedRegion:
+def _region(later: Visit, expected: BeamComparison, beams: Ints) -> MarkedRegion:
     points = later.ends[beams]
     nearer = later.range_m[beams] < expected.ranges[beams]
     hull = cv2.convexHull(points.astype(np.float32))[:, 0].astype(float)

@@ -192,7 +192,7 @@ def occlusion_map(grid: Grid, pose: Array, angles: Array, ranges: Array, margin_
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class BeamComparison:
     """Beams (n,) against what is expected of them.
 
     Attributes:
@@ -217,7 +217,7 @@ class Comparison:
         return np.asarray((np.nan_to_num(self.d2) > gate) & ~self.dismissed)
 
     @classmethod
-    def joined(cls, parts: "Sequence[Comparison]") -> "Comparison":
+    def joined(cls, parts: "Sequence[BeamComparison]") -> "BeamComparison":
         """Several scans one after another."""
         return cls(
             np.concatenate([part.ranges for part in parts]),
@@ -235,7 +235,7 @@ def compare_scan(
     angles: Array,
     ranges: Array,
     noise: LaserNoise,
-) -> Comparison:
+) -> BeamComparison:
     """One scan against the reference map (5.13, 5.14) and the occlusion map (5.4).
 
     Args:
@@ -256,7 +256,7 @@ def compare_scan(
     hidden = (cell < 0) | ~visible[cell]
     # what stands where the reference was occluded may have been there all along
     dismissed = hidden & (ranges < np.nan_to_num(expected))
-    return Comparison(expected, np.sqrt(expected_covs[:, 0, 0]), d2, np.asarray(dismissed))
+    return BeamComparison(expected, np.sqrt(expected_covs[:, 0, 0]), d2, np.asarray(dismissed))
 
 
 def changed_beams(

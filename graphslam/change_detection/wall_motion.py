@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.change_detection.beam_evidence import MIN_COSINE, Evidence
+from graphslam.change_detection.beam_evidence import MIN_COSINE, BeamEvidence
 from graphslam.change_detection.rigid_registration import Registration
 from graphslam.change_detection.shapes import (
     PIECES_PER_WINDOW,
@@ -135,7 +135,7 @@ def segment_motions(
     registration: Registration,
     surfaces: tuple[Surface, Surface],
     visits: tuple[Visit, Visit],
-    evidence: tuple[Evidence, Evidence],
+    evidence: tuple[BeamEvidence, BeamEvidence],
     settings: MotionSettings,
     sigma: float,
 ) -> list[tuple[Array, Array, Displacement]]:
@@ -177,7 +177,7 @@ def segment_motions(
 
 
 def _segment_at(
-    ends: Array, surface: Surface, visit: Visit, evidence: Evidence, sigma: float
+    ends: Array, surface: Surface, visit: Visit, evidence: BeamEvidence, sigma: float
 ) -> WallSegment | None:
     """The segment of a visit's surface at a line of its map, if it moved and its ends were seen."""
     along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))

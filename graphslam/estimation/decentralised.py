@@ -38,9 +38,9 @@ from graphslam.estimation.landmark_ties import tied
 from graphslam.estimation.local_smoother import (
     KEY_BYTES,
     NUMBER_BYTES,
+    FactorMessage,
     LocalSmoother,
     Measurement,
-    Message,
     number_in,
     owner_of,
     prefix_of,
@@ -64,7 +64,7 @@ class DecentralisedBackend(GraphBackend):
         self._next_ns: int | None = None
         self.robots: list[LocalSmoother] = []
         self._queried: LocalSmoother | None = None  # the robot whose state was queried last
-        self._network: Network[Message] = Network(config.network)
+        self._network: Network[FactorMessage] = Network(config.network)
         self.own_names = config.network.landmarks == "own"
         self._now_ns = 0
         self.messages = 0
@@ -155,7 +155,10 @@ class DecentralisedBackend(GraphBackend):
             self._take(robot, by_name[packet.sender], packet.messages)
 
     def _take(
-        self, robot: LocalSmoother, sender: LocalSmoother, messages: Iterable[tuple[int, Message]]
+        self,
+        robot: LocalSmoother,
+        sender: LocalSmoother,
+        messages: Iterable[tuple[int, FactorMessage]],
     ) -> None:
         """Let a robot use the messages of another one that are next."""
         accepted = robot.inboxes[sender.name].accept(messages)

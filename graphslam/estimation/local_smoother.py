@@ -36,7 +36,7 @@ class Measurement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Message:
+class FactorMessage:
     """What a robot sends to the others: factors, and values of their variables.
 
     ``sightings`` are factors between its states and those of others, ``size`` all of it in bytes.
@@ -71,8 +71,10 @@ class LocalSmoother:
     waiting: list[gtsam.NonlinearFactor] = field(default_factory=list)
     prefix: int = 0
     ties: list[tuple[int, int]] = field(default_factory=list)
-    outbox: Outbox[Message] = field(default_factory=Outbox)
-    inboxes: defaultdict[str, Inbox[Message]] = field(default_factory=lambda: defaultdict(Inbox))
+    outbox: Outbox[FactorMessage] = field(default_factory=Outbox)
+    inboxes: defaultdict[str, Inbox[FactorMessage]] = field(
+        default_factory=lambda: defaultdict(Inbox)
+    )
     last_sent: int = 0
     sent: int = 0
     measured: int = 0
@@ -86,7 +88,7 @@ class LocalSmoother:
                 self.dims[key] = len(value)
                 self.new_values[key] = value
 
-    def receive(self, messages: Iterable[Message]) -> None:
+    def receive(self, messages: Iterable[FactorMessage]) -> None:
         """Add messages; sightings wait until both of their states are known."""
         for message in messages:
             self.add(message.factors, message.values)
@@ -143,7 +145,7 @@ class LocalSmoother:
         made = [f.rekey(own) for f, own in zip(measurement.factors, keys, strict=True)]
         return Measurement(tuple(made), measurement.size)
 
-    def message(self, shared: set[int]) -> Message:
+    def message(self, shared: set[int]) -> FactorMessage:
         """Its own measurements since the last message, states that are not ``shared`` eliminated.
 
         These need no prior: the chain of states ties them to shared ones.
@@ -171,7 +173,7 @@ class LocalSmoother:
             size += as_measured
         keys = {key for factor in content for key in factor.keys()}  # noqa: SIM118
         values = {key: points[key] for key in keys}
-        return Message(content, values, [f for one in sightings for f in one.factors], size)
+        return FactorMessage(content, values, [f for one in sightings for f in one.factors], size)
 
 
 def _sections(

@@ -39,7 +39,7 @@ EXPERIMENTS: dict[str, Path] = {
 
 
 @dataclass(frozen=True)
-class Motions:
+class PlannedMotions:
     """A part of a planned path: ``steps`` equal motions, each forward and then a turn."""
 
     steps: int = field(metadata={"least": 1})
@@ -52,7 +52,7 @@ class BenchRobot:
     """A robot on the bench: the mean of its prior, and its path."""
 
     start_m: Point
-    path: tuple[Motions, ...]
+    path: tuple[PlannedMotions, ...]
     start_deg: float = 0.0
 
 

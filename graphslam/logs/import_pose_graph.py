@@ -34,7 +34,7 @@ ROUNDING = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
-class Edge:
+class PoseGraphEdge:
     """Pose (3,) of ``end`` in the frame of ``start``; ``cov`` (3, 3) along the axes of *end*.
 
     This is gtsam's convention: the error is the logarithm of measured^-1 * predicted.
@@ -60,7 +60,7 @@ class LandmarkEdge:
 class PoseGraph:
     """Contents of a file in its order; ``ignored`` counts lines by tag, ``assumed`` by reason."""
 
-    edges: list[Edge] = field(default_factory=list)
+    edges: list[PoseGraphEdge] = field(default_factory=list)
     sightings: list[LandmarkEdge] = field(default_factory=list)
     ignored: Counter[str] = field(default_factory=Counter)
     assumed: Counter[str] = field(default_factory=Counter)
@@ -91,7 +91,7 @@ def import_pose_graph(source: Path, target: Path) -> ImportSummary:
     number = {pose: k for k, pose in enumerate(poses)}
     odometry, others = split_odometry(graph.edges, poses)
     robots = assign_robots(source, odometry, poses)
-    closures: dict[int, list[Edge]] = {}
+    closures: dict[int, list[PoseGraphEdge]] = {}
     for edge in others:
         closures.setdefault(edge.end, []).append(edge)
     sightings: dict[int, list[LandmarkEdge]] = {}
@@ -125,7 +125,7 @@ def import_pose_graph(source: Path, target: Path) -> ImportSummary:
     return ImportSummary(source, target, log.counts, (*warnings, f"{source}: stamps are {_STAMPS}"))
 
 
-def _write(write: Callable[..., None], number: dict[int, int], edge: Edge) -> None:
+def _write(write: Callable[..., None], number: dict[int, int], edge: PoseGraphEdge) -> None:
     """Write an edge; covariances of a log are along the axes of its start, gtsam's of its end."""
     start_ns, end_ns = pose_stamp_ns(number[edge.start]), pose_stamp_ns(number[edge.end])
     cov = rotate_cov(edge.cov, float(edge.delta[2]))
@@ -136,15 +136,15 @@ def _write(write: Callable[..., None], number: dict[int, int], edge: Edge) -> No
 
 
 def split_odometry(
-    edges: Iterable[Edge], poses: Sequence[int]
-) -> tuple[dict[int, Edge], list[Edge]]:
+    edges: Iterable[PoseGraphEdge], poses: Sequence[int]
+) -> tuple[dict[int, PoseGraphEdge], list[PoseGraphEdge]]:
     """Odometry edges by the pose that they lead to, and all other edges.
 
     The first edge between two neighbours in ``poses`` is odometry. Every edge is made to lead from
     the earlier pose to the later one, see `reverse_edge`.
     """
     following = dict(pairwise(poses))
-    odometry: dict[int, Edge] = {}
+    odometry: dict[int, PoseGraphEdge] = {}
     others = []
     for edge in edges:
         forward = edge if edge.start < edge.end else reverse_edge(edge)
@@ -156,7 +156,7 @@ def split_odometry(
 
 
 def assign_robots(
-    source: Path, odometry: Mapping[int, Edge], poses: Sequence[int]
+    source: Path, odometry: Mapping[int, PoseGraphEdge], poses: Sequence[int]
 ) -> dict[int, str]:
     """Pose -> its robot; a new robot begins at each pose that no odometry leads to.
 
@@ -177,14 +177,14 @@ def assign_robots(
     return {p: f"robot{n:0{digits}}" for p, n in zip(poses, number, strict=True)}
 
 
-def reverse_edge(edge: Edge) -> Edge:
+def reverse_edge(edge: PoseGraphEdge) -> PoseGraphEdge:
     """The same measurement as the pose of ``start`` in the frame of ``end``.
 
     Exact for gtsam's error: with h = z exp(e) the inverse is h^-1 = z^-1 exp(-Ad_z e).
     """
     Ad = adjoint(edge.delta)
     cov = np.asarray(Ad @ edge.cov @ Ad.T)
-    return Edge(edge.end, edge.start, inverse(edge.delta), cov)
+    return PoseGraphEdge(edge.end, edge.start, inverse(edge.delta), cov)
 
 
 # ---------------------------------------------------------------- the file
@@ -220,7 +220,7 @@ def _edge(graph: PoseGraph, fields: Sequence[str], is_g2o: bool) -> None:
     if start == end:
         raise ValueError("start and end are the same pose")
     cov, assumed = _pose_covariance(tuple(_numbers(noise, 6).tolist()), is_g2o)
-    graph.edges.append(Edge(start, end, delta, cov))
+    graph.edges.append(PoseGraphEdge(start, end, delta, cov))
     graph.assumed[_NO_INFORMATION] += assumed
 
 

@@ -18,8 +18,8 @@ from graphslam.core.geometry import Array, compose
 from graphslam.logs import schemas
 from graphslam.logs.cdr_writing import imu_bytes, tf_bytes
 from graphslam.logs.import_summary import ImportSummary
-from graphslam.logs.mrpt_objects import Findings
-from graphslam.logs.mrpt_rawlog import Item, LaserScan, Motion, Reading, TurnRate, read_rawlog
+from graphslam.logs.mrpt_objects import SkippedObjects
+from graphslam.logs.mrpt_rawlog import Item, LaserScan, RawlogMotion, Reading, TurnRate, read_rawlog
 from graphslam.logs.physical_limits import MAX_RANGE_M
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import MOST_BYTES
@@ -57,7 +57,7 @@ def import_rawlog(source: Path, target: Path) -> ImportSummary:
         LogError: ``source`` cannot be read, is no rawlog, or has nothing that is used.
         OutputError: ``target`` cannot be written.
     """
-    findings, notes = Findings(), list[str]()
+    findings, notes = SkippedObjects(), list[str]()
     # all in memory, about 4 bytes per beam: lasers and log times are known at the end
     items = list(_bounded(source, read_rawlog(source, findings)))
     messages = list(_with_odometry(items, notes))
@@ -102,7 +102,7 @@ def _bounded(source: Path, items: Iterable[Item]) -> Iterator[Item]:
         yield item
 
 
-def _problems(findings: Findings) -> list[str]:
+def _problems(findings: SkippedObjects) -> list[str]:
     """What was not read, most first."""
     found = [(n, f"{n} {name} are not used") for name, n in findings.skipped.items()]
     found += [(n, f"{n} left out: {why}") for why, n in findings.damaged.items()]
@@ -122,10 +122,10 @@ def _with_odometry(items: Sequence[Item], notes: list[str]) -> Iterator[_Message
 
     A motion ends at its own time; older ones state none and end at the first observation behind.
     """
-    motions: dict[int, Motion] = {}
+    motions: dict[int, RawlogMotion] = {}
     for item in items:
         # several motions in one collection are one: that of odometry, or the first
-        if isinstance(item, Motion) and (
+        if isinstance(item, RawlogMotion) and (
             motions.setdefault(item.group, item).matched and not item.matched
         ):
             motions[item.group] = item
@@ -134,7 +134,7 @@ def _with_odometry(items: Sequence[Item], notes: list[str]) -> Iterator[_Message
         motions = {}
     pose, open_ended = np.zeros(3), 0
     for item in items:
-        if not isinstance(item, Motion):
+        if not isinstance(item, RawlogMotion):
             if open_ended and item.stamp_ns is not None:
                 yield Reading(item.stamp_ns, "", _plain(pose))
                 open_ended = 0

@@ -38,7 +38,7 @@ class UnreadableError(Exception):
 
 
 @dataclass
-class Findings:
+class SkippedObjects:
     """What was not read, by class, and where the stream is damaged (empty: nowhere)."""
 
     skipped: Counter[str] = field(default_factory=Counter)
@@ -55,7 +55,7 @@ class ObjectReader:
         findings: where damage of the packing is noted.
     """
 
-    def __init__(self, source: Path, stream: BinaryIO, findings: Findings) -> None:
+    def __init__(self, source: Path, stream: BinaryIO, findings: SkippedObjects) -> None:
         self._source = source
         self._findings = findings
         self._parts = self._unpacked(stream)

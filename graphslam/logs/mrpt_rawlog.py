@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array
-from graphslam.logs.mrpt_objects import Findings, ObjectReader, UnreadableError
+from graphslam.logs.mrpt_objects import ObjectReader, SkippedObjects, UnreadableError
 from graphslam.logs.physical_limits import MAX_POSITION_M
 from graphslam.logs.source_files import unreadable
 
@@ -40,7 +40,7 @@ class Reading(NamedTuple):
     pose: Pose
 
 
-class Motion(NamedTuple):
+class RawlogMotion(NamedTuple):
     """The base relative to where it was before the motion.
 
     ``group``: number of its collection, whose motions are one. ``matched``: not by odometry.
@@ -75,10 +75,10 @@ class TurnRate(NamedTuple):
     rad_s: float
 
 
-Item = Reading | Motion | LaserScan | TurnRate
+Item = Reading | RawlogMotion | LaserScan | TurnRate
 
 
-def read_rawlog(source: Path, findings: Findings) -> Iterator[Item]:
+def read_rawlog(source: Path, findings: SkippedObjects) -> Iterator[Item]:
     """The items of the file ``source`` in its order; what is not among them: ``findings``.
 
     Raises:
@@ -93,7 +93,7 @@ def read_rawlog(source: Path, findings: Findings) -> Iterator[Item]:
         raise unreadable(source, error) from error
 
 
-def _items(source: Path, data: ObjectReader, findings: Findings) -> Iterator[Item]:
+def _items(source: Path, data: ObjectReader, findings: SkippedObjects) -> Iterator[Item]:
     group, known = 0, False
     there = data.begin()
     while there:
@@ -114,7 +114,7 @@ def _items(source: Path, data: ObjectReader, findings: Findings) -> Iterator[Ite
                     raise UnreadableError(f"of version {version}")
                 item = read(data, version)
                 data.end()
-                yield item._replace(group=group) if isinstance(item, Motion) else item
+                yield item._replace(group=group) if isinstance(item, RawlogMotion) else item
             there = data.begin()
         except UnreadableError as error:
             if not known:
@@ -218,7 +218,7 @@ def _reading(data: ObjectReader, version: int) -> Reading:
     return Reading(stamp_ns, label, pose)
 
 
-def _motion(data: ObjectReader, version: int) -> Motion:
+def _motion(data: ObjectReader, version: int) -> RawlogMotion:
     """CActionRobotMovement2D: an increment of odometry with options of a noise model, or a PDF."""
     if version < 2:
         delta = _mean(data)
@@ -232,7 +232,7 @@ def _motion(data: ObjectReader, version: int) -> Motion:
     for size in (velocities, ticks) if version else ():
         if data.take(1)[0] or version < 7:
             data.take(size)
-    return Motion(_stamp(data) if version >= 6 else None, 0, delta, matched)
+    return RawlogMotion(_stamp(data) if version >= 6 else None, 0, delta, matched)
 
 
 def _mean(data: ObjectReader) -> Pose:

@@ -19,7 +19,13 @@ from graphslam.logs.findings import Finding, topics_setting
 from graphslam.logs.recording import Recording
 from graphslam.logs.schemas import DEFAULT_ROBOT, ODOMETRY
 from graphslam.logs.tf_odometry import Chain, find_chain, with_odometry
-from graphslam.logs.tf_tree import Edge, moving_topics, namespace_of, sampled_edges, static_tree
+from graphslam.logs.tf_tree import (
+    TransformEdge,
+    moving_topics,
+    namespace_of,
+    sampled_edges,
+    static_tree,
+)
 from graphslam.logs.topic_context import sample_decoded
 from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic, find_topics
 from graphslam.logs.twist_odometry import twist_topics, with_twist_odometry
@@ -64,11 +70,11 @@ class _Frames:
     """What tf says, read when it is asked for."""
 
     files: Sequence[Recording]
-    _trees: dict[str, tuple[dict[str, Edge], dict[str, tuple[str, Array]]]] = field(
+    _trees: dict[str, tuple[dict[str, TransformEdge], dict[str, tuple[str, Array]]]] = field(
         default_factory=dict
     )
 
-    def tree(self, space: str) -> tuple[dict[str, Edge], dict[str, tuple[str, Array]]]:
+    def tree(self, space: str) -> tuple[dict[str, TransformEdge], dict[str, tuple[str, Array]]]:
         """Edges on /tf, and static transforms, of a namespace."""
         if space not in self._trees:
             edges = sampled_edges(self.files, space)

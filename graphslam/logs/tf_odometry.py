@@ -15,7 +15,7 @@ from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
 from graphslam.logs.cdr_writing import odometry_bytes
 from graphslam.logs.recording import Derived, Recording, raw_messages
-from graphslam.logs.tf_tree import Edge, matrix_of, moving_topics, transforms_of
+from graphslam.logs.tf_tree import TransformEdge, matrix_of, moving_topics, transforms_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Chain:
 
 
 def find_chain(
-    sensor: str, edges: Mapping[str, Edge], static: Mapping[str, tuple[str, Array]]
+    sensor: str, edges: Mapping[str, TransformEdge], static: Mapping[str, tuple[str, Array]]
 ) -> Chain | None:
     """The odometry of the robot that carries the frame ``sensor``; None if nothing above moves.
 
@@ -75,7 +75,7 @@ def find_chain(
 
 
 def _parent(
-    frame: str, edges: Mapping[str, Edge], static: Mapping[str, tuple[str, Array]]
+    frame: str, edges: Mapping[str, TransformEdge], static: Mapping[str, tuple[str, Array]]
 ) -> str | None:
     if frame in edges:
         return edges[frame].parent

@@ -38,7 +38,7 @@ class Transform(NamedTuple):
 
 
 @dataclass(slots=True)
-class Edge:
+class TransformEdge:
     """A transform from ``parent`` to ``child`` as seen in several messages of a topic.
 
     ``first``: its values in the first of them. ``moves``: they differ; ``still``: how many of the
@@ -109,9 +109,9 @@ def static_topics(recording: Recording) -> list[str]:
     ]
 
 
-def sampled_edges(files: Sequence[Recording], space: str) -> dict[str, Edge]:
+def sampled_edges(files: Sequence[Recording], space: str) -> dict[str, TransformEdge]:
     """The edges on the topics ``/tf`` of a namespace (and on those of all), by their child."""
-    found: dict[str, Edge] = {}
+    found: dict[str, TransformEdge] = {}
     for file in files:
         for topic in moving_topics(file):
             if _is_of(topic, space):
@@ -120,9 +120,11 @@ def sampled_edges(files: Sequence[Recording], space: str) -> dict[str, Edge]:
     return found
 
 
-def _add_edges(found: dict[str, Edge], topic: str, messages: Iterable[list[Transform]]) -> None:
+def _add_edges(
+    found: dict[str, TransformEdge], topic: str, messages: Iterable[list[Transform]]
+) -> None:
     for _, parent, child, values in (one for message in messages for one in message):
-        edge = found.setdefault(child, Edge(topic, parent, child, values))
+        edge = found.setdefault(child, TransformEdge(topic, parent, child, values))
         edge.seen += 1
         edge.still += _is_near(edge.first, values)
         if not edge.moves:
@@ -138,8 +140,8 @@ def _is_near(first: Sequence[float], values: Sequence[float]) -> bool:
 
 
 def moving_link(
-    edges: Mapping[str, Edge], tree: Mapping[str, tuple[str, Array]], base: str, frame: str
-) -> Edge | None:
+    edges: Mapping[str, TransformEdge], tree: Mapping[str, tuple[str, Array]], base: str, frame: str
+) -> TransformEdge | None:
     """The lowest link between ``base`` and a ``frame`` on it that moves; None if there is none.
 
     ``edges`` and ``tree``, transforms (4, 4), are by the child: `sampled_edges`, `static_tree`.
@@ -166,7 +168,7 @@ def decoded(messages: Iterable[bytes]) -> Iterator[list[Transform]]:
 
 
 def static_tree(
-    files: Sequence[Recording], space: str, edges: dict[str, Edge]
+    files: Sequence[Recording], space: str, edges: dict[str, TransformEdge]
 ) -> dict[str, tuple[str, Array]]:
     """Static transforms of a namespace, and those of ``edges`` that do not move, or hardly.
 

@@ -28,7 +28,7 @@ from graphslam.logs.mounts import (
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.point_cloud import cloud_points, sweep_of
 from graphslam.logs.recording import Recording, sample_messages
-from graphslam.logs.tf_tree import Edge, moving_link, sampled_edges, static_tree
+from graphslam.logs.tf_tree import TransformEdge, moving_link, sampled_edges, static_tree
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic
 
 # 16 x 16 messages over the whole log: enough to find a frequent value, quick to read
@@ -136,9 +136,9 @@ class _SensorFrames:
         """``bases``: robot -> frame that moves; ``by_wheels``: robots whose wheels tell how."""
         self._files, self._config, self._bases = files, config, bases
         self._by_wheels = by_wheels
-        self._trees: dict[str, tuple[dict[str, Edge], TransformTree]] = {}
+        self._trees: dict[str, tuple[dict[str, TransformEdge], TransformTree]] = {}
 
-    def _transforms(self, robot: str) -> tuple[dict[str, Edge], TransformTree]:
+    def _transforms(self, robot: str) -> tuple[dict[str, TransformEdge], TransformTree]:
         if robot not in self._trees:
             edges = sampled_edges(self._files, robot)
             self._trees[robot] = edges, static_tree(self._files, robot, edges)
@@ -299,7 +299,7 @@ def _mount(
     topic: Topic,
     tree: TransformTree,
     base: str,
-    of: tuple[str, str, Edge | None],
+    of: tuple[str, str, TransformEdge | None],
     configured: Sequence[float],
 ) -> tuple[Mount, list[Finding]]:
     """The mount of a sensor on the robot, and findings; one that is configured is level.

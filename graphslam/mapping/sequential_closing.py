@@ -33,7 +33,7 @@ from graphslam.mapping.loop_closure import (
     known_part,
     verified_closures,
 )
-from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
+from graphslam.mapping.submap_graph import SubmapConstraints, SubmapGraph
 from graphslam.mapping.submaps import State, SubmapPose
 
 #: submaps that are taken at a time, and rounds until nothing more is closed among them, at most
@@ -166,11 +166,11 @@ class _Closer:
             self.at[closure.robot, closure.time_ns],
         )
 
-    def relative_poses(self) -> RelativePoses:
+    def relative_poses(self) -> SubmapConstraints:
         """The accepted closures as arrays."""
         found = list(self.accepted.values())
         ends = self.nodes[np.array([self.ends(c) for c in found])]
-        return RelativePoses(
+        return SubmapConstraints(
             ends[:, 0], ends[:, 1], np.array([c.delta for c in found]),
             np.array([c.cov for c in found]),
         )  # fmt: skip

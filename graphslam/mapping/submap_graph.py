@@ -37,7 +37,7 @@ COLUMNS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RelativePoses:
+class SubmapConstraints:
     """Measured poses (m, 3) of submaps ``end`` (m,) in the frames of submaps ``begin`` (m,).
 
     ``cov`` (m, 3, 3) is along the axes of the frames in which they are given.
@@ -48,16 +48,18 @@ class RelativePoses:
     delta: Array
     cov: Array
 
-    def and_also(self, other: "RelativePoses") -> "RelativePoses":
+    def and_also(self, other: "SubmapConstraints") -> "SubmapConstraints":
         """Both."""
-        return RelativePoses(*(
+        return SubmapConstraints(*(
             np.concatenate([getattr(self, name), getattr(other, name)])
             for name in ("begin", "end", "delta", "cov")
         ))  # fmt: skip
 
-    def only(self, which: BoolArray) -> "RelativePoses":
+    def only(self, which: BoolArray) -> "SubmapConstraints":
         """Some of them."""
-        return RelativePoses(self.begin[which], self.end[which], self.delta[which], self.cov[which])
+        return SubmapConstraints(
+            self.begin[which], self.end[which], self.delta[which], self.cov[which]
+        )
 
 
 def relative_jacobian(h: Array) -> Array:
@@ -77,7 +79,7 @@ class SubmapGraph:
     """
 
     def __init__(
-        self, poses: Array, chain: RelativePoses, first: Sequence[int], start_cov: Array
+        self, poses: Array, chain: SubmapConstraints, first: Sequence[int], start_cov: Array
     ) -> None:
         """Begin at ``poses``; the ``chain`` joins the submaps of each path, in their order.
 
@@ -87,7 +89,7 @@ class SubmapGraph:
         self.poses = np.array(poses)
         self._all, self._first = chain, np.asarray(first)
         self._starts, self._start_info = self.poses[self._first], np.linalg.inv(start_cov)
-        self._closures: RelativePoses | None = None
+        self._closures: SubmapConstraints | None = None
         self._set_used(np.ones(len(self.poses), dtype=bool))
 
     def _set_used(self, used: BoolArray) -> None:
@@ -112,7 +114,7 @@ class SubmapGraph:
             self.poses[end] = compose(self.poses[begin], self._all.delta[edge])
         self._set_used(used)
 
-    def solve(self, closures: RelativePoses | None = None) -> None:
+    def solve(self, closures: SubmapConstraints | None = None) -> None:
         """Solve with these closures, beginning where the poses are."""
         self._closures = closures
         edges, information = self._measured()
@@ -173,12 +175,12 @@ class SubmapGraph:
         columns[rows, np.arange(len(rows))] = 1.0
         return np.asarray(self._factor.solve(columns))
 
-    def _measured(self) -> tuple[RelativePoses, Array]:
+    def _measured(self) -> tuple[SubmapConstraints, Array]:
         """Chain and closures, and their information (m, 3, 3) along the axes of their ends."""
         edges = self._chain if self._closures is None else self._chain.and_also(self._closures)
         return edges, np.asarray(np.linalg.inv(rotate_cov(edges.cov, -edges.delta[:, 2])))
 
-    def _error(self, edges: RelativePoses, information: Array) -> float:
+    def _error(self, edges: SubmapConstraints, information: Array) -> float:
         """Half of the squared error."""
         off = log(between(edges.delta, between(self.poses[edges.begin], self.poses[edges.end])))
         begun = log(between(self._starts, self.poses[self._first]))
@@ -187,7 +189,7 @@ class SubmapGraph:
             + np.einsum("ij,ijk,ik", begun, self._start_info, begun)
         )
 
-    def _gradient(self, edges: RelativePoses, information: Array) -> Array:
+    def _gradient(self, edges: SubmapConstraints, information: Array) -> Array:
         """The gradient (3u,) at the u poses in use."""
         h = between(self.poses[edges.begin], self.poses[edges.end])
         pull = (information @ log(between(edges.delta, h))[:, :, None])[:, :, 0]
@@ -199,7 +201,7 @@ class SubmapGraph:
         gradient[self._first] += (self._start_info @ off[:, :, None])[:, :, 0]
         return gradient[self._used].ravel()
 
-    def _factorised(self, edges: RelativePoses, information: Array) -> SuperLU:
+    def _factorised(self, edges: SubmapConstraints, information: Array) -> SuperLU:
         """The matrix of the normal equations at the poses, factorised."""
         m = len(edges.begin)
         h = between(self.poses[edges.begin], self.poses[edges.end])

@@ -18,7 +18,7 @@ AT_ONCE, SUMMED = 1 << 20, 63
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OccupancyGrid:
+class CorrelationGrid:
     """Cells of ``cell_m``: ``values`` (nx, ny), 1 where occupied, 0 unknown; first at ``low`` (2,).
 
     `BESIDE` next to occupied cells. All are multiples of a half.
@@ -61,7 +61,7 @@ class OccupancyGrid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridSpectrum:
-    """Fourier transform of an `OccupancyGrid`, padded to ``shape``; its ``low`` and ``cell_m``."""
+    """Fourier transform of a `CorrelationGrid`, padded to ``shape``; its ``low`` and ``cell_m``."""
 
     transformed: NDArray[np.complex64]
     shape: tuple[int, int]
@@ -84,7 +84,7 @@ def occupancy_grid(
     margin: ArrayLike,
     free: Array | None = None,
     free_value: float = 0.0,
-) -> OccupancyGrid:
+) -> CorrelationGrid:
     """The grid of occupied points (n, 2) m.
 
     On each side are ``margin`` empty cells, one number or (2,), at least 1.
@@ -94,7 +94,7 @@ def occupancy_grid(
     margin = np.asarray(margin)
     low = points.min(axis=0) - margin * cell_m
     cells = _cells(points - low, cell_m)
-    grid = OccupancyGrid(np.zeros(cells.max(axis=0) + margin + 1, dtype=np.float32), low, cell_m)
+    grid = CorrelationGrid(np.zeros(cells.max(axis=0) + margin + 1, dtype=np.float32), low, cell_m)
     values = grid.values
     if free is not None:
         at = grid.cells(free)
@@ -108,7 +108,7 @@ def occupancy_grid(
     return grid
 
 
-def grid_spectrum(grid: OccupancyGrid) -> GridSpectrum:
+def grid_spectrum(grid: CorrelationGrid) -> GridSpectrum:
     """The Fourier transform of a grid, for correlation at all shifts."""
     from scipy import fft  # noqa: PLC0415  (imports for long)
 

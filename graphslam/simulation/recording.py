@@ -55,7 +55,7 @@ class RobotSummary:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class SimulatedLog:
     """A log that was written, with data that only the simulator knows."""
 
     visit: SimulatedVisit
@@ -70,7 +70,7 @@ def sensor_rng(seed: int, *names: str) -> np.random.Generator:
     return np.random.default_rng([seed, *(zlib.crc32(name.encode()) for name in names)])
 
 
-def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: int) -> Recording:
+def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: int) -> SimulatedLog:
     """Simulate a visit and write its log to ``path``.
 
     Raises:
@@ -109,7 +109,7 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
             log.true_landmark(first_ns, **landmark)
         for event in events:
             event.write(log)
-    return Recording(visit, path, log.counts, robots, ideal_scans)
+    return SimulatedLog(visit, path, log.counts, robots, ideal_scans)
 
 
 def _notes(scenario: Scenario, visit: SimulatedVisit, seed: int) -> dict[str, str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from graphslam.core.errors import OutputError
 from graphslam.core.output_folder import atomic_folder, check_nothing_else_in, identity
-from graphslam.simulation.recording import Recording, record_visit
+from graphslam.simulation.recording import SimulatedLog, record_visit
 from graphslam.simulation.scenario import Scenario
 from graphslam.simulation.scene import prepare_visits
 from graphslam.simulation.true_changes import true_changes
@@ -24,7 +24,7 @@ class Simulation:
     scenario: str
     seed: int
     target: Path
-    recordings: tuple[Recording, ...]
+    recordings: tuple[SimulatedLog, ...]
     changed_cells: int
 
     @property

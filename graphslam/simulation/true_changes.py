@@ -14,7 +14,7 @@ from graphslam.core.geometry import Array, inverse, transform, unit_vectors
 from graphslam.logs.writer import xy_phi
 from graphslam.simulation.laser import beam_fan
 from graphslam.simulation.raycast import points_in_frames
-from graphslam.simulation.recording import NoiseFreeScans, Recording
+from graphslam.simulation.recording import NoiseFreeScans, SimulatedLog
 from graphslam.simulation.scenario import LaterVisit, Scenario
 from graphslam.simulation.scene import SimulatedVisit
 from graphslam.simulation.world import displacement
@@ -24,7 +24,7 @@ _CORNERS = 24  # of the polygon that approximates a circle
 
 
 def true_changes(
-    scenario: Scenario, recordings: tuple[Recording, Recording], seed: int
+    scenario: Scenario, recordings: tuple[SimulatedLog, SimulatedLog], seed: int
 ) -> dict[str, Any]:
     """The contents of truth.json; see docs/simulator.md. World frame of the simulator."""
     later = scenario.later or LaterVisit()
@@ -75,7 +75,7 @@ def _polygon(visit: SimulatedVisit, name: str) -> list[list[float]] | None:
     return None
 
 
-def _cells(recording: Recording, names: set[str]) -> dict[tuple[int, int], str]:
+def _cells(recording: SimulatedLog, names: set[str]) -> dict[tuple[int, int], str]:
     """Cells in which noise-free beams ended on one of the named objects -> its name."""
     world = recording.visit.world
     cells: dict[tuple[int, int], str] = {}

@@ -12,7 +12,7 @@ from graphslam.mapping.known_map import MAP_ROBOT, KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.redundant_closures import Span
 from graphslam.mapping.sequential_closing import close_loops
-from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
+from graphslam.mapping.submap_graph import SubmapConstraints, SubmapGraph
 from graphslam.mapping.submaps import State, SubmapPose, submaps_at
 from graphslam.slam.scan_tracking import TrackedLog, TrackedPath
 
@@ -157,7 +157,7 @@ def close_paths(
         poses += [place.pose for place in known_map.places]
         first_nodes += places.tolist()
         start_covs += [PLACE_COV] * len(places)
-    chain = RelativePoses(
+    chain = SubmapConstraints(
         np.array(begin, dtype=np.int64),
         np.array(begin, dtype=np.int64) + 1,
         np.concatenate(delta),

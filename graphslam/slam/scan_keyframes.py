@@ -97,11 +97,11 @@ class ReadLog:
 
 
 @dataclass(frozen=True, slots=True)
-class ReadAhead:
+class AwaitCalibration:
     """Nothing to work on: from here on the calibration is waited for."""
 
 
-ReadItem = KeyframeBlock | ReadLog | ReadAhead
+ReadItem = KeyframeBlock | ReadLog | AwaitCalibration
 
 
 def read_keyframes(
@@ -110,14 +110,14 @@ def read_keyframes(
     """The keyframes of the only robot of a log, and last a `ReadLog`.
 
     What is sent is the calibration for later motions. After ``uncalibrated`` blocks it is waited
-    for: before, some of what follows is read, then comes a `ReadAhead`.
+    for: before, some of what follows is read, then comes a `AwaitCalibration`.
     """
     reader = _Reader(log, with_noted_keyframes(log, config), log.robots[0])
     for number, block in enumerate(reader.blocks(), 1):
         found = yield block
         if number == uncalibrated:
             reader.read_ahead()
-            found = yield ReadAhead()
+            found = yield AwaitCalibration()
         if found is not None:
             reader.run.track.calibration = found
     yield reader.read_log()

@@ -11,7 +11,7 @@ import pytest
 from test_detect import CONFIG, FAN, SIGMA, box, drive, visit, walls
 
 from graphslam.change_detection import detect_changes
-from graphslam.change_detection.beam_evidence import Evidence, beams_past_surfaces, null_sigma
+from graphslam.change_detection.beam_evidence import BeamEvidence, beams_past_surfaces, null_sigma
 from graphslam.change_detection.grid import grid_over
 from graphslam.change_detection.regions import find_regions
 from graphslam.change_detection.surface_map import fit_surfaces
@@ -26,7 +26,7 @@ def evidence_of(scores):
     n = len(scores)
     none, ones = np.zeros(0, dtype=np.int64), np.ones(n)
     every = np.ones(n, dtype=bool)
-    return (Evidence(none, none, scores, ones, ones, 0 * ones, every, np.zeros(n, np.int64)),)
+    return (BeamEvidence(none, none, scores, ones, ones, 0 * ones, every, np.zeros(n, np.int64)),)
 
 
 @pytest.mark.parametrize("true", [1.0, 3.0])

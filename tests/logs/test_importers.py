@@ -19,7 +19,7 @@ from graphslam.core.errors import LogError
 from graphslam.core.geometry import rotation3
 from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
 from graphslam.logs.import_carmen import parse_stamp_ns
-from graphslam.logs.import_pose_graph import Edge, reverse_edge
+from graphslam.logs.import_pose_graph import PoseGraphEdge, reverse_edge
 
 
 def example(name: str) -> Path:
@@ -94,7 +94,7 @@ def test_factors_are_those_that_gtsam_reads(name, tmp_path):
             a, b = factor.keys()
             keys |= {a, b}
             m = factor.measured()
-            edge = Edge(a, b, np.array([m.x(), m.y(), m.theta()]), covariance(factor))
+            edge = PoseGraphEdge(a, b, np.array([m.x(), m.y(), m.theta()]), covariance(factor))
             between.append(edge if a < b else reverse_edge(edge))
         else:
             pose, landmark = factor.keys()
@@ -166,7 +166,7 @@ def test_a_turned_edge_has_the_same_error_at_any_state(delta, off):
     To 1e-5, as gtsam's logarithm cancels at small angles: at 1e-9 rad it is good to seven digits.
     """
     cov = np.diag([0.1, 0.2, 0.3])
-    there, back = Edge(0, 1, delta, cov), reverse_edge(Edge(0, 1, delta, cov))
+    there, back = PoseGraphEdge(0, 1, delta, cov), reverse_edge(PoseGraphEdge(0, 1, delta, cov))
     values = gtsam.Values()
     values.insert(0, gtsam.Pose2(1.0, 2.0, 0.5))
     values.insert(1, gtsam.Pose2(1.0, 2.0, 0.5) * gtsam.Pose2(*delta) * gtsam.Pose2(*(0.3 * off)))

@@ -6,7 +6,7 @@ from graphslam.core.config import LoopClosureConfig
 from graphslam.core.gaussian import symmetric
 from graphslam.mapping import sequential_closing
 from graphslam.mapping.sequential_closing import MAX_VISITS, _Closer
-from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
+from graphslam.mapping.submap_graph import SubmapConstraints, SubmapGraph
 from graphslam.mapping.submaps import SubmapPose
 
 PER_LAP, STEP_M = 20, 2.0
@@ -22,7 +22,7 @@ def laps(count):
     begin = np.arange(n - 1)
     delta = np.tile([STEP_M, 0.0, 2 * np.pi / PER_LAP], (n - 1, 1))
     cov = np.diag([0.1, 0.1, 0.05]) ** 2
-    chain = RelativePoses(begin, begin + 1, delta, np.tile(cov, (n - 1, 1, 1)))
+    chain = SubmapConstraints(begin, begin + 1, delta, np.tile(cov, (n - 1, 1, 1)))
     graph = SubmapGraph(poses, chain, [0], symmetric(1e-8 * np.eye(3))[None])
     submaps = [SubmapPose(("r", k), pose, STEP_M * k, (k, k), None) for k, pose in enumerate(poses)]
     return _Closer(submaps, np.arange(n), graph, LoopClosureConfig())

@@ -6,7 +6,7 @@ import pytest
 
 from graphslam.core.geometry import between, compose, log, rotate_cov
 from graphslam.estimation import factors
-from graphslam.mapping.submap_graph import RelativePoses, SubmapGraph
+from graphslam.mapping.submap_graph import SubmapConstraints, SubmapGraph
 from graphslam.slam.path_closing import LandmarkUncertainty, follow
 
 START = 1e-8 * np.eye(3)[None]
@@ -25,8 +25,8 @@ def ring(n=12, seed=0):
     for d in delta:
         poses.append(compose(poses[-1], d))
     begin = np.arange(n - 1)
-    chain = RelativePoses(begin, begin + 1, delta, np.tile(COV, (n - 1, 1, 1)))
-    closure = RelativePoses(
+    chain = SubmapConstraints(begin, begin + 1, delta, np.tile(COV, (n - 1, 1, 1)))
+    closure = SubmapConstraints(
         np.array([0]), np.array([n - 1]), between(true[0], true[-1])[None], 0.04 * COV[None]
     )
     return true, chain, np.array(poses), closure
@@ -92,7 +92,7 @@ def test_what_follows_says_nothing_about_the_beginning():
     """Solved up to a closure, poses and covariances are those of the whole graph, and what follows
     is where the chain puts it. Breaks if what hangs behind is forgotten, or put where it was."""
     true, chain, poses, _ = ring(n=20)
-    closure = RelativePoses(
+    closure = SubmapConstraints(
         np.array([2]), np.array([11]), between(true[2], true[11])[None], 0.04 * COV[None]
     )
     whole, part = (SubmapGraph(poses, chain, [0], START) for _ in range(2))
@@ -112,7 +112,7 @@ def test_what_follows_says_nothing_about_the_beginning():
 def test_the_beginnings_of_several_paths():
     """A path of which nothing is used yet is its first submap, which its closures do not move."""
     _, chain, poses, _ = ring(n=4)
-    two = RelativePoses(*(
+    two = SubmapConstraints(*(
         np.concatenate([a, a + 4 if k < 2 else a])
         for k, a in enumerate((chain.begin, chain.end, chain.delta, chain.cov))
     ))  # fmt: skip
@@ -120,7 +120,9 @@ def test_the_beginnings_of_several_paths():
     graph.begin_with(np.array([2]))
     assert graph.covariance(np.array([2, 4])).shape == (6, 6)
     graph.begin_with(np.array([2, 5]))
-    same = RelativePoses(np.array([1]), np.array([5]), np.zeros((1, 3)), 0.05**2 * np.eye(3)[None])
+    same = SubmapConstraints(
+        np.array([1]), np.array([5]), np.zeros((1, 3)), 0.05**2 * np.eye(3)[None]
+    )
     graph.solve(same)
     np.testing.assert_allclose(graph.poses[5], graph.poses[1], atol=1e-3)
 
@@ -152,14 +154,16 @@ def test_a_path_whose_start_is_uncertain_is_placed_by_its_closures():
     """Two paths, the second one started 0.5 m off with a sigma of 0.3 m: one closure of 5 cm
     between them moves all of it, the first path stays."""
     _, chain, poses, _ = ring(n=4)
-    two = RelativePoses(*(
+    two = SubmapConstraints(*(
         np.concatenate([a, a + 4 if k < 2 else a])
         for k, a in enumerate((chain.begin, chain.end, chain.delta, chain.cov))
     ))  # fmt: skip
     off = compose(np.array([0.5, 0.0, 0.0]), poses)
     starts = np.array([1e-8 * np.eye(3), np.diag([0.3, 0.3, 0.1]) ** 2])
     graph = SubmapGraph(np.concatenate([poses, off]), two, [0, 4], starts)
-    same = RelativePoses(np.array([1]), np.array([5]), np.zeros((1, 3)), 0.05**2 * np.eye(3)[None])
+    same = SubmapConstraints(
+        np.array([1]), np.array([5]), np.zeros((1, 3)), 0.05**2 * np.eye(3)[None]
+    )
     graph.solve(same)
     np.testing.assert_allclose(graph.poses[:4], poses, atol=0.03)
     np.testing.assert_allclose(graph.poses[4:, :2], graph.poses[:4, :2], atol=0.08)
@@ -175,10 +179,10 @@ def test_two_visits_of_a_long_wall_are_compared_where_both_were_near():
     n = np.arange(len(x) - 1)
     cov = np.tile(np.diag([0.02, 0.005, 0.002]) ** 2, (len(n), 1, 1))
     graph = SubmapGraph(
-        poses, RelativePoses(n, n + 1, between(poses[:-1], poses[1:]), cov), [0], START
+        poses, SubmapConstraints(n, n + 1, between(poses[:-1], poses[1:]), cov), [0], START
     )
     graph.solve(
-        RelativePoses(
+        SubmapConstraints(
             np.array([0]), np.array([len(x) - 1]), between(poses[0], poses[-1])[None],
             np.diag([0.01, 0.01, 0.002])[None] ** 2,
         )
@@ -204,10 +208,10 @@ def test_closures_that_bend_the_path_far_do_not_throw_it_away(seed):
         np.diag(np.square(sigmas)) for sigmas in ((0.05, 0.05, 0.5), (0.02, 0.02, 5e-3))
     )
     at = np.arange(n)
-    chain = RelativePoses(at[:-1], at[1:], delta, np.tile(loose, (n - 1, 1, 1)))
+    chain = SubmapConstraints(at[:-1], at[1:], delta, np.tile(loose, (n - 1, 1, 1)))
     begin, end = rng.integers(0, 20, m), rng.integers(35, n, m)
     wrong = np.column_stack([rng.normal(0, 1, (m, 2)), rng.uniform(-3, 3, m)])
-    closures = RelativePoses(begin, end, wrong, np.tile(tight, (m, 1, 1)))
+    closures = SubmapConstraints(begin, end, wrong, np.tile(tight, (m, 1, 1)))
     graph = SubmapGraph(np.array(poses), chain, [0], 1e-4 * np.eye(3)[None])
 
     def error():
