@@ -34,7 +34,7 @@ from graphslam.core.geometry import Array, compose, inverse
 from graphslam.core.records import Result, Trajectory
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import read_truth
-from graphslam.results.known_map import load_known_map
+from graphslam.results.known_map_file import load_known_map
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Leg, Scenario, ScenarioError, Wall
 

@@ -197,7 +197,7 @@ def smooth(
         # imported while the second process reads; what only that one needs is imported there
         from graphslam.core.stages import announce
         from graphslam.results.folder import save
-        from graphslam.results.known_map import known_map_files, known_map_of
+        from graphslam.results.known_map_file import known_map_files, known_map_of
         from graphslam.slam.checkpoint import checkpoint
         from graphslam.slam.smooth import smooth
 

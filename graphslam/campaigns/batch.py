@@ -128,7 +128,7 @@ def _with_known_map(config: Config, backends: Sequence[str]) -> tuple[Config, st
         return config, ""
     if backends:
         raise ConfigError("known_map.directory: back ends are compared without a known map")
-    from graphslam.results.known_map import known_map_of  # noqa: PLC0415
+    from graphslam.results.known_map_file import known_map_of  # noqa: PLC0415
 
     known = known_map_of(config)
     directory = os.fspath(Path(config.known_map.directory).resolve())

@@ -18,7 +18,7 @@ from graphslam.evaluation.ground_truth import errors_of_run, truth_of_logs
 from graphslam.evaluation.timed_replay import TimedReplay, timed_replay
 from graphslam.logs import open_logs
 from graphslam.results.folder import save
-from graphslam.results.known_map import known_map_files, known_map_of
+from graphslam.results.known_map_file import known_map_files, known_map_of
 from graphslam.results.report import render
 from graphslam.results.small_map import draw, small_map
 from graphslam.slam.smooth import smooth

@@ -2,8 +2,8 @@
 
 The frames are registered by landmarks (`rigid_registration`), or, where the maps are bent against
 each other and no rigid motion fits, by the scans along the paths (`nonrigid_registration`). Then
-every scan is aligned with the reference's surfaces within its covariance (`scan_to_map`), and once
-more without the beams that seem to have hit something that changed.
+every scan is aligned with the reference's surfaces within its covariance (`surface_alignment`), and
+once more without the beams that seem to have hit something that changed.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ from graphslam.change_detection.rigid_registration import (
     landmarks_of_map,
     register_rivals,
 )
-from graphslam.change_detection.scan_to_map import align_scans
+from graphslam.change_detection.surface_alignment import align_scans
 from graphslam.change_detection.surface_map import Surface, fit_surfaces
 from graphslam.change_detection.visit import Bools, Ints, Visit, scatter_of_ranges
 from graphslam.core.config import ChangesConfig

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import norm
 
 from graphslam.change_detection.grid import row_sums, sorted_unique, window_sums
-from graphslam.change_detection.scan_to_map import surface_offsets
+from graphslam.change_detection.surface_alignment import surface_offsets
 from graphslam.change_detection.surface_map import (
     WINDOW,
     Surface,

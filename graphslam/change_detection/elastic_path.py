@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from graphslam.change_detection.scan_to_map import scan_normal_equations
+from graphslam.change_detection.surface_alignment import scan_normal_equations
 from graphslam.change_detection.surface_map import Surface
 from graphslam.change_detection.visit import Visit
 from graphslam.core.geometry import Array, between, compose, wrap

@@ -21,8 +21,8 @@ from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
-from graphslam.estimation.information_root import information_root, solve_root
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
+from graphslam.estimation.joint_covariances import information_root, solve_root
 from graphslam.estimation.line_noise import fit_line_noise
 from graphslam.estimation.line_residuals import LineResiduals
 from graphslam.estimation.optimisation import (

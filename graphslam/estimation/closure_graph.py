@@ -13,8 +13,8 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Closure, Estimate, Step
 from graphslam.estimation import factors
-from graphslam.estimation.information_root import information_root, pair_covariances
 from graphslam.estimation.isam2 import BatchGraph, with_means
+from graphslam.estimation.joint_covariances import information_root, pair_covariances
 from graphslam.estimation.optimisation import (
     CONVERGED_ERROR_ROUGH,
     is_wide,

@@ -33,13 +33,13 @@ from graphslam.estimation.backend import (
     StateTable,
     block_slices,
 )
-from graphslam.estimation.information_root import information_root
 from graphslam.estimation.input_checks import (
     describe,
     describe_motion,
     describe_start,
     indeterminate,
 )
+from graphslam.estimation.joint_covariances import information_root
 from graphslam.estimation.optimisation import joint_marginal
 from graphslam.estimation.selected_inverse import CliqueRows
 

@@ -10,8 +10,8 @@ from graphslam.core.geometry import Array, path_length, rotate_cov, rotation3
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.observation_models import LineModel
 from graphslam.estimation import factors
-from graphslam.estimation.information_root import covariance_of
 from graphslam.estimation.isam2 import observed_ends
+from graphslam.estimation.joint_covariances import covariance_of
 from graphslam.estimation.posterior_residuals import Residuals
 from graphslam.estimation.recorded_graph import IntArray, RecordedGraph
 from graphslam.estimation.weighed_walls import WeighedWalls, weighed_walls

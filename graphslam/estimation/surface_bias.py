@@ -18,7 +18,7 @@ from graphslam.core.information_root import InformationRoot, IntArray
 from graphslam.core.observation_models import MODELS, LineModel
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate
-from graphslam.estimation.information_root import mount_errors, solve_root
+from graphslam.estimation.joint_covariances import mount_errors, solve_root
 from graphslam.estimation.weighed_walls import WeighedWalls
 
 #: beams of a wall at which the bias is looked at

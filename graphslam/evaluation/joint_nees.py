@@ -11,7 +11,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array, adjoint, between, compose, inverse, rotation3
 from graphslam.core.records import IntArray, JointScans, RobotResult
-from graphslam.estimation.information_root import covariance_of, joint_covariance
+from graphslam.estimation.joint_covariances import covariance_of, joint_covariance
 from graphslam.odometry.mount_covariance import moved_by_mount, moved_by_world
 from graphslam.results.folder import SavedRobot
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from graphslam.core.geometry import Array, adjoint, between, inverse
 from graphslam.core.records import IntArray, JointScans, Trajectory
-from graphslam.estimation.information_root import pair_covariances
+from graphslam.estimation.joint_covariances import pair_covariances
 
 #: pairs whose covariances are computed at a time, from the first scan on: bounds the memory
 AT_ONCE = 20_000

@@ -19,7 +19,7 @@ from graphslam.logs.record_checks import UnusableMessageError, checked
 from graphslam.logs.time_order import DROPPED, MessageSorter
 from graphslam.logs.topics import MOTION_KINDS, Topic
 from graphslam.multi_robot.frame_tree import FrameAssignment
-from graphslam.results.known_map import known_map_of
+from graphslam.results.known_map_file import known_map_of
 from graphslam.slam.log_pass import PriorKnowledge
 from graphslam.slam.log_reader import TRUE_RECORDS
 from graphslam.slam.recorded_closures import RecordedClosures

@@ -1,7 +1,7 @@
 """joint.npz: what the joint covariance of any scans of a result follows from.
 
 All of their covariances would be as many numbers as there are pairs. The root of the information of
-the final states is sparse; `graphslam.estimation.information_root` computes from it what is asked
+the final states is sparse; `graphslam.estimation.joint_covariances` computes from it what is asked
 for. The layout is documented in docs/formats.md.
 """
 

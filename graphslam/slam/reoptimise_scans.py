@@ -18,8 +18,8 @@ from graphslam.core.geometry import Array, compose, inverse, rotate_cov
 from graphslam.core.records import Closure, Estimate, KeyframeScan, Start, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate, recompute_motions
 from graphslam.estimation.calibration_graph import CalibratedSolution
-from graphslam.estimation.information_root import mount_errors
 from graphslam.estimation.isam2 import Reoptimiser
+from graphslam.estimation.joint_covariances import mount_errors
 from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,

@@ -26,7 +26,7 @@ from graphslam.change_detection.path_refinement import refine_path, refine_toget
 from graphslam.change_detection.regions import counter_clockwise, find_regions, outline
 from graphslam.change_detection.report import render_changes
 from graphslam.change_detection.rigid_registration import register
-from graphslam.change_detection.scan_to_map import align_scans
+from graphslam.change_detection.surface_alignment import align_scans
 from graphslam.change_detection.surface_map import fit_surfaces
 from graphslam.change_detection.visit import on_surface, select_time_span
 from graphslam.cli.commands import app

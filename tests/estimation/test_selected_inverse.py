@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from graphslam.estimation.information_root import information_root, pair_covariances
+from graphslam.estimation.joint_covariances import information_root, pair_covariances
 from graphslam.estimation.optimisation import marginals_of
 from graphslam.estimation.selected_inverse import covariance_blocks
 

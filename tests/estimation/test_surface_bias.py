@@ -12,7 +12,7 @@ from graphslam.core.information_root import InformationRoot
 from graphslam.core.record import replace
 from graphslam.estimation import calibration_graph, surface_bias
 from graphslam.estimation.factors import FIRST_STATE
-from graphslam.estimation.information_root import joint_covariance
+from graphslam.estimation.joint_covariances import joint_covariance
 from graphslam.estimation.surface_bias import COMMON, bias_of_lines, surface_errors
 from graphslam.estimation.weighed_walls import WeighedWalls
 from graphslam.perception.line_fit import fit_lines

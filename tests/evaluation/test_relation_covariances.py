@@ -12,7 +12,7 @@ from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import adjoint, between, compose, exp, log
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.records import JointScans, OdometryPose, Trajectory
-from graphslam.estimation.information_root import pair_covariances
+from graphslam.estimation.joint_covariances import pair_covariances
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_covariances import relative_covariances
 from graphslam.evaluation.relation_metrics import Relations

@@ -13,7 +13,7 @@ from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.core.geometry import rotate_cov, rotation3
 from graphslam.mapping.landmark_records import ALONG, SHORTEST_M
 from graphslam.results.folder import JOINT_FILE
-from graphslam.results.known_map import (
+from graphslam.results.known_map_file import (
     KNOWN_MAP_FILE,
     landmark_covariance,
     load_known_map,

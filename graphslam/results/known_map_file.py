@@ -24,7 +24,7 @@ from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
 from graphslam.core.record import replace
 from graphslam.core.records import JointScans, KeyframeScan, Landmark, Result, Trajectory
 from graphslam.core.sparse_gaussian import sparse_root
-from graphslam.estimation.information_root import joint_covariance, mount_errors
+from graphslam.estimation.joint_covariances import joint_covariance, mount_errors
 from graphslam.mapping.known_map import KnownMap, latest_places, map_place
 from graphslam.mapping.map_update import (
     with_covariances,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.information_root import InformationRoot
-from graphslam.estimation.information_root import (
+from graphslam.estimation.joint_covariances import (
     covariance_of,
     information_root,
     joint_covariance,
