@@ -11,7 +11,7 @@ from typing import Any
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import chosen_config
-from graphslam.core.errors import GraphSlamError, LogError
+from graphslam.core.errors import LogError
 from graphslam.core.output_folder import Identity, identity
 from graphslam.core.records import Landmark, Message
 from graphslam.core.worker import Future
@@ -91,7 +91,7 @@ def follow(
                 state = f"has not grown for {chosen.live.wait_s:g} s"
         except KeyboardInterrupt:
             state = "interrupted"
-        except GraphSlamError as error:
+        except Exception as error:  # what was estimated until then is kept
             folder.warnings.append(str(error))
             if len(folder.history):
                 folder.write("stopped")

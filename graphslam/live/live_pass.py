@@ -79,7 +79,9 @@ class LivePass(Pipeline):
         self.known_seen: set[int] = set()
         self.on_map = self.off_map = 0
         self._reported: dict[str, LiveEstimate] = {}
-        self._closures = 0  # that were reported
+        self._closures = 0  # that are in `_closed_ns`, or were reported
+        self._closed_ns: dict[str, int] = {}  # from when on a robot's next estimate has a closure
+        self._placed = 0  # of `keyframe_scans`
         closes = self.config.backend.close_loops and self._known_map is None
         self._busy = 0  # scans in a row that became keyframes
         self._closer = LoopCloser(self.config, self.backend, self.frames.of) if closes else None
@@ -98,6 +100,8 @@ class LivePass(Pipeline):
             if not self.steps and not waiting and _is_odometry(event):
                 continue  # most of a recording: nothing was seen, and nothing is to be forgotten
             self.record_covariances()
+            self._note_closures()
+            self._add_places()
             # odometry becomes an event at once
             waiting = alone and any(isinstance(message, ODOMETRY) for message in ready)
             if waiting:
@@ -108,12 +112,27 @@ class LivePass(Pipeline):
                 yield from self._report(robot, run, event)
             self.forget()
 
+    def _add_places(self) -> None:
+        """Keep places while their states are in the window."""
+        if self._closer is not None:
+            self._closer.add(self.keyframe_scans[self._placed :])
+            self._placed = len(self.keyframe_scans)
+
+    def _note_closures(self, *, of_places: bool = False) -> None:
+        """Landmarks that were found again move what is reported from now on.
+
+        Those ``of_places`` have moved the last state of every robot, and what follows it.
+        """
+        if self.associator.closures > self._closures:
+            self._closures = self.associator.closures
+            for robot, run in self.started.items():
+                self._closed_ns.setdefault(robot, run.state_ns if of_places else self.last_ns)
+
     def _close_loops(self) -> None:
         """Look for places that were passed before; what they say moves the estimate."""
         if self._closer is None:
             return
         if self.keyframe_scans:
-            self._closer.add(self.keyframe_scans)
             self._busy += 1
             if self._busy <= BUSY:
                 return  # such a scan takes time enough
@@ -127,6 +146,7 @@ class LivePass(Pipeline):
             # what is reported from now on is seen from there
             run.latest_pose = run.causal_poses[-1] = self.backend.state_mean(robot)
             del run.causal_covs[len(run.times) - 1 :]
+        self._note_closures(of_places=True)
 
     def start_step(self, robot: str, time_ns: int) -> Step:
         """See `StepRecorder`; a known map enters with the first robot."""
@@ -168,8 +188,6 @@ class LivePass(Pipeline):
         if run.since_keyframe is not None:
             run.since_keyframe.forget()
         odometry = run.track.pose(when)
-        closed = self.associator.closures > self._closures
-        self._closures = self.associator.closures
         points = {
             (one.robot, one.time_ns): transform(inverse(one.sensor), one.points)
             for one in self.keyframe_scans
@@ -181,6 +199,9 @@ class LivePass(Pipeline):
                 expected = compose(before.pose, between(before.odometry, odometry[k]))
                 jump = between(expected, pose)
             scan = None if causal.scan is None else causal.scan.poses[k]
+            closed = robot in self._closed_ns and times[k] >= self._closed_ns[robot]
+            if closed:
+                del self._closed_ns[robot]
             made = LiveEstimate(
                 robot, stamp, pose, causal.base.covs[k], odometry[k], jump, closed, frame, scan,
                 points.get((robot, times[k])),
@@ -221,6 +242,7 @@ class LivePass(Pipeline):
             self.keyframe_scans, self.step_ms, self.innovations,
         ):  # fmt: skip
             history.clear()
+        self._placed = 0
         before_ns = self.last_ns - self._memory_ns
         for robot, run in self.started.items():
             self.landmarks.expire(self.last_ns, robot, math.inf, self._memory_ns, 0.0)

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
+from numbers import Integral
 from typing import Any
 
 from graphslam.core.config import Config
@@ -17,7 +18,7 @@ from graphslam.logs import LogSet
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.record_checks import UnusableMessageError, checked
 from graphslam.logs.time_order import DROPPED, MessageSorter
-from graphslam.logs.topics import MOTION_KINDS, Topic
+from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.results.known_map_file import known_map_of
 from graphslam.slam.log_pass import PriorKnowledge
@@ -180,10 +181,13 @@ class Session:
     def _records(self, messages: Iterable[Message]) -> Iterator[Message]:
         """What is a message at all."""
         for message in messages:
-            if isinstance(message, Message):
-                yield message
-            else:
+            if not isinstance(message, Message):
                 self._unused[f"{type(message).__name__}: is no record of graphslam"] += 1
+            elif not (isinstance(message.robot, str) and isinstance(message.time_ns, Integral)):
+                what = type(message).__name__
+                self._unused[f"{what}: robot must be a text, time_ns a whole number"] += 1
+            else:
+                yield message
 
     def _expected(self, messages: Iterable[Message]) -> Iterator[Message]:
         """The messages that can be used."""
@@ -194,7 +198,10 @@ class Session:
                 continue
             if (message.robot, type(message)) not in kinds:
                 what = type(message).__name__.lower()
-                self._unused[f"{what}: {message.robot} did not send any at first"] += 1
+                why = f"{message.robot} did not send any at first"
+                if isinstance(message, ODOMETRY_KINDS):
+                    why = f"not used, as {message.robot} has another kind of odometry"
+                self._unused[f"{what}: {why}"] += 1
                 continue
             try:
                 usable = checked(message)
@@ -263,6 +270,8 @@ def live_config(config: Config) -> Config:
     if config.known_map.update:
         raise ConfigError("known_map.update: needs a whole log; smooth the recording with --update")
     horizon = backend.horizon_s if math.isfinite(backend.horizon_s) else config.live.horizon_s
+    if horizon <= 0:
+        raise ConfigError("live.horizon_s: live estimates need a horizon above 0 s")
     return replace(config, backend=replace(backend, name="isam2", horizon_s=horizon))
 
 
@@ -294,7 +303,7 @@ def expected_log(kinds: Mapping[str, Sequence[type[Message]]], config: Config) -
         Topic(f"/{robot}/{kind.__name__.lower()}", "", robot, kind, 1)
         for robot, own in sorted(kinds.items())
         for kind in own
-        if kind not in TRUE_RECORDS
+        if kind not in TRUE_RECORDS and kind not in _further_odometry(own)
     )
     records = {topic.record for topic in topics}
     if not records & {Scan, Sighting} or not records & {*MOTION_KINDS}:
@@ -315,6 +324,11 @@ def expected_log(kinds: Mapping[str, Sequence[type[Message]]], config: Config) -
         _contexts={topic.name: TopicContext(topic.robot) for topic in topics},
         config=config,
     )
+
+
+def _further_odometry(kinds: Sequence[type[Message]]) -> list[type[Message]]:
+    """All kinds of odometry of a robot but the one that is used, see `choose_topics`."""
+    return [kind for kind in ODOMETRY_KINDS if kind in kinds][1:]
 
 
 def known_starts(log: LogSet, config: Config) -> PriorKnowledge:

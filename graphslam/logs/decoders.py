@@ -30,8 +30,6 @@ from graphslam.logs.record_checks import (
     checked_covariance,
 )
 
-#: no planar laser takes longer for a sweep; it may take so much more of the time that is stated
-MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
 #: decimals of a heading, rad, that are taken from a quaternion. Written again, it differs by 1e-16:
 #: a solution, which ends where it has converged, would differ by 1e-9 m
 HEADING_DECIMALS = 12
@@ -131,12 +129,12 @@ def _beam_periods(rows: Any, beams: int) -> list[float]:
     """Time between two beams of each scan, s: ``time_increment`` where it can be true, else 0.
 
     Some drivers write nonsense: a sweep is neither longer than ``scan_time``, if that is given, nor
-    than `MAX_SWEEP_S`.
+    than `physical_limits.MAX_SWEEP_S`.
     """
     between, whole = (rows[name].astype(float) for name in ("time_increment", "scan_time"))
-    most = np.where((whole > 0) & (whole < MAX_SWEEP_S), whole, MAX_SWEEP_S)
+    most = np.where((whole > 0) & (whole < limits.MAX_SWEEP_S), whole, limits.MAX_SWEEP_S)
     with np.errstate(invalid="ignore"):
-        true = (between > 0) & (between * (beams - 1) <= SWEEP_SLACK * most)
+        true = (between > 0) & (between * (beams - 1) <= limits.SWEEP_SLACK * most)
     found: list[float] = np.where(true, between, 0.0).tolist()
     return found
 

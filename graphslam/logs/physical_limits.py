@@ -8,6 +8,12 @@ whole map, or the arithmetic. The limits are far from all that is known to be re
 MAX_RANGE_M = 1000.0
 #: bearing and range to a landmark, also by radio, m
 MAX_SIGHTING_M = 1e5
+#: nearer a landmark has no bearing, m
+MIN_SIGHTING_M = 1e-6
+#: sensors on a robot, m from its base
+MAX_MOUNT_M = 1000.0
+#: no planar laser takes longer for a sweep, s; it may take so much more of the time that is stated
+MAX_SWEEP_S, SWEEP_SLACK = 1.0, 1.05
 #: positions in a frame, which may be that of a map of the Earth (UTM), and relative poses, m
 MAX_POSITION_M = 1e8
 #: angles that add up: years of turning wheels, rad

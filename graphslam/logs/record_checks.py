@@ -38,6 +38,11 @@ def _with_arrays(message: records.Message) -> records.Message:
     what = type(message).__name__
     if not all(isinstance(t, Integral) for t in (message.stamp_ns, message.time_ns)):
         raise UnusableMessageError(f"{what}: stamp_ns and time_ns must be whole numbers")
+    if not isinstance(getattr(message, "start_ns", 0), Integral):
+        raise UnusableMessageError(f"{what}: start_ns must be a whole number")
+    for field, also in _TEXTS.items():
+        if not isinstance(getattr(message, field, ""), also):
+            raise UnusableMessageError(f"{what}: {field} must be a text")
     sizes: dict[str, int] = {}
     arrays: dict[str, Array] = {}
     for field, shape in _SHAPES.get(type(message), {}).items():
@@ -88,6 +93,13 @@ def check_wheels(left_rad: float, right_rad: float) -> None:
         raise UnusableMessageError("joints: angle is beyond what a wheel turns")
 
 
+def check_mount(what: str, mount: Array) -> None:
+    """Raises `UnusableMessageError` where no robot carries a sensor at a pose (3,)."""
+    check_finite(what, mount)
+    if np.abs(mount[:2]).max() > limits.MAX_MOUNT_M or abs(mount[2]) > limits.MAX_ANGLE_RAD:
+        raise UnusableMessageError(f"{what}: the sensor is beyond any robot")
+
+
 def check_beams(number: int, angle_min_rad: float, angle_step_rad: float) -> None:
     """Raises `UnusableMessageError` where a scan has no beams, or they have no directions."""
     if not number:
@@ -100,7 +112,7 @@ def check_sighting(z: Array) -> None:
     """Raises `UnusableMessageError` where no bearing rad, range m and direction rad are like z."""
     if not all(map(math.isfinite, z.tolist())):
         raise UnusableMessageError("sighting: not finite")
-    if z[1] <= 0:
+    if z[1] < limits.MIN_SIGHTING_M:
         raise UnusableMessageError("sighting: range is not positive")
     if z[1] > limits.MAX_SIGHTING_M:
         raise UnusableMessageError("sighting: range is beyond what anything measures")
@@ -141,6 +153,7 @@ def _sighting(message: records.Sighting) -> None:
     if len(message.z) not in (2, 3):
         raise UnusableMessageError("Sighting: z must be bearing, range and perhaps direction")
     check_sighting(message.z)
+    check_mount("sighting", message.mount)
     checked_covariance("sighting", message.cov, len(message.z))
 
 
@@ -165,7 +178,16 @@ def _relative_pose(message: records.RelativePose) -> None:
 
 
 def _scan(message: records.Scan) -> None:
-    check_beams(len(message.ranges), message.angle_min_rad, message.angle_step_rad)
+    n = len(message.ranges)
+    check_beams(n, message.angle_min_rad, message.angle_step_rad)
+    check_mount("scan", message.mount)
+    sweep_s = abs(message.beam_period_s) * (n - 1)
+    if not sweep_s <= limits.SWEEP_SLACK * limits.MAX_SWEEP_S:
+        raise UnusableMessageError(
+            "scan: beam_period_s is not finite, or longer than a sweep takes"
+        )
+    if message.bearings is not None:
+        check_finite("scan: bearings", message.bearings)
 
 
 #: the numbers of records; where the same letter stands, the same number of elements
@@ -184,6 +206,11 @@ _SHAPES: dict[type[records.Message], dict[str, tuple[int | str, ...]]] = {
     records.Sighting: {"z": ("k",), "cov": ("k", "k"), "mount": (3,)},
     records.RelativePose: {"delta": (3,), "cov": (3, 3)},
 }
+#: fields that are texts, some of which may be None
+_TEXTS: dict[str, type | tuple[type, ...]] = {
+    "robot": str, "other": str, "sensor": str, "may_be": str,
+    "identity": (str, type(None)), "seen_robot": (str, type(None)),
+}  # fmt: skip
 #: those that a record need not have
 _OPTIONAL = frozenset({"bearings"})
 

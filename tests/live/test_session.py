@@ -9,7 +9,7 @@ from room_log import MOUNT, START_NS, drive, true_pose
 
 import graphslam
 from graphslam.core.geometry import between, compose
-from graphslam.core.records import Closure, OdometryPose, Scan, Sighting
+from graphslam.core.records import Closure, OdometryPose, Scan, Sighting, WheelAngles
 from graphslam.live import live_pass
 
 HORIZON_S = 8.0
@@ -122,10 +122,39 @@ def test_a_loop_that_a_place_closes_moves_the_estimate_and_says_so(room, monkeyp
     """By no more than it says. This one is wrong, so landmarks take some of it back."""
     monkeypatch.setattr(live_pass, "LoopCloser", OneClosure)
     found = list(graphslam.Session().process(room[1]))
+    assert sum(e.loop_closed for e in found) == 1
     said = next(e for e in found if np.hypot(*e.jump[:2]) > 0.1)
     assert said.loop_closed
     assert np.hypot(*said.jump[:2]) < 0.6
     assert not any(e.loop_closed for e in found[: found.index(said)])
+
+
+class OneClosureOfTwo(OneClosure):
+    """Closes a loop between the robots a and b once: b is 0.3 m beside where it was thought."""
+
+    def closures(self, _time_ns):
+        own = {robot: [s for s in self.states if s[0] == robot] for robot in "ab"}
+        if self.is_done or min(map(len, own.values())) < 20:
+            return ()
+        self.is_done = True
+        ends, cov = (*own["b"][-1], *own["a"][-1]), 1e-6 * np.eye(3)
+        return (Closure(*ends, np.array([0.3, 0.0, 0.0]), cov, verified=True),)
+
+
+def test_a_closed_loop_is_said_of_every_robot_that_it_moves(room, monkeypatch):
+    """Breaks if only the robot says so whose scan comes next."""
+    monkeypatch.setattr(live_pass, "LoopCloser", OneClosureOfTwo)
+    late_ns = S // 20
+    both = [
+        replace(m, robot=robot, stamp_ns=m.stamp_ns + ns, time_ns=m.time_ns + ns)
+        for m in room[1]
+        for robot, ns in (("a", 0), ("b", late_ns))
+    ]
+    session = graphslam.Session(start={"poses": {"a": [0, 0, 0], "b": [0, 0, 0]}})
+    found = list(session.process(sorted(both, key=lambda m: m.time_ns)))
+    said = [e for e in found if e.loop_closed]
+    assert sorted(e.robot for e in said) == ["a", "b"]
+    assert all(np.hypot(*e.jump[:2]) > 0.2 for e in said)  # then landmarks take some of it back
 
 
 def test_estimates_are_where_the_robot_is(live):
@@ -424,3 +453,32 @@ def test_scans_that_come_at_once_are_reported_together_and_no_later(room):
     for a, b in zip(found, one_by_one, strict=True):
         np.testing.assert_allclose(a.pose, b.pose, rtol=0, atol=1e-6)
         np.testing.assert_allclose(a.cov, b.cov, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("horizon_s", [1.0, HORIZON_S])
+def test_more_may_come_at_once_than_the_horizon_holds(room, horizon_s):
+    """Half a minute. Breaks if places are kept only once their states are forgotten."""
+    session = graphslam.Session(live={"horizon_s": horizon_s, "reorder_s": 30.0})
+    found = list(session.process(room[1]))
+    assert len(found) == sum(isinstance(m, Scan) for m in room[1])
+
+
+def test_of_two_kinds_of_odometry_one_is_used_and_the_other_is_counted(room):
+    """As of a robot with /odom and /joint_states."""
+    wheels = [
+        WheelAngles(m.robot, m.stamp_ns, m.time_ns, 10.0 * k, 10.0 * k)
+        for k, m in enumerate(room[1])
+        if isinstance(m, OdometryPose)
+    ]
+    session = graphslam.Session()
+    found = list(session.process(sorted([*room[1], *wheels], key=lambda m: m.time_ns)))
+    alone = list(graphslam.Session().process(room[1]))
+    assert np.array_equal([e.pose for e in found], [e.pose for e in alone])
+    (said,) = session.dropped
+    assert said == "wheelangles: not used, as robot has another kind of odometry"
+    assert session.dropped[said] == len(wheels)
+
+
+def test_a_horizon_of_nothing_is_refused():
+    with pytest.raises(graphslam.ConfigError, match=r"live.horizon_s: .* above 0 s"):
+        graphslam.Session(live={"horizon_s": 0.0})

@@ -3,10 +3,18 @@
 import numpy as np
 import pytest
 
-from graphslam.core.records import Scan, WheelAngles
+from graphslam.core.records import (
+    OdometryIncrement,
+    RelativePose,
+    Scan,
+    Sighting,
+    WheelAngles,
+)
 from graphslam.logs.record_checks import UnusableMessageError, checked
 
 SCAN = Scan("robot", 1, 1, np.ones(3), 0.0, 0.1, np.zeros(3))
+
+SEEN = Sighting("robot", 1, 1, np.array([0.1, 2.0]), 1e-4 * np.eye(2), None, None, np.zeros(3))
 
 
 def changed(record, **values):
@@ -28,7 +36,22 @@ def test_a_record_that_is_right_is_the_same_one():
         (changed(SCAN, angle_min_rad=np.inf), "scan: angle increment is zero or angles are not"),
         (changed(SCAN, angle_step_rad=0.0), "scan: angle increment is zero or angles are not"),
         (changed(SCAN, ranges=np.empty(0)), "scan: no beams"),
+        (changed(SCAN, mount=np.array([0.0, np.nan, 0.0])), "scan: not finite"),
+        (changed(SCAN, mount=np.array([1e30, 0.0, 0.0])), "scan: the sensor is beyond any robot"),
+        (changed(SCAN, beam_period_s=np.nan), "scan: beam_period_s is not finite, or longer"),
+        (changed(SCAN, beam_period_s=1e3), "scan: beam_period_s is not finite, or longer"),
+        (changed(SCAN, bearings=np.array([0.0, np.nan, 0.2])), "scan: bearings: not finite"),
+        (changed(SCAN, stamp_ns=1.5), "Scan: stamp_ns and time_ns must be whole numbers"),
         (WheelAngles("robot", 1, 1, None, 0.0), "WheelAngles: left_rad must be a number"),
+        (changed(SEEN, mount=np.array([0.0, 0.0, np.inf])), "sighting: not finite"),
+        (changed(SEEN, z=np.array([0.0, 1e-9])), "sighting: range is not positive"),
+        (changed(SEEN, identity=5), "Sighting: identity must be a text"),
+        (changed(SEEN, seen_robot=["b"]), "Sighting: seen_robot must be a text"),
+        (
+            OdometryIncrement("robot", 1, 1, None, np.zeros(3), np.eye(3)),
+            "start_ns must be a whole",
+        ),
+        (RelativePose("robot", 1, 1, "robot", None, np.zeros(3), np.eye(3)), "start_ns must be a"),
     ],
 )
 def test_what_is_missing_or_of_another_shape_is_said(record, reason):
