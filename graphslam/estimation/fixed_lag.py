@@ -39,7 +39,11 @@ class FixedLagBackend(GraphBackend):
 
     At the end, states that left have the estimate and covariance with which they left: smoothed
     with the data within the horizon. What refers to a state that has left is skipped and counted.
+    ``most_states``: if there are more in the window the oldest leave before the horizon; one of
+    each robot stays.
     """
+
+    most_states: int | None = None
 
     def __init__(self, config: Config) -> None:
         # weights are of residuals at the current estimate, so the window applies the kernel
@@ -146,6 +150,14 @@ class FixedLagBackend(GraphBackend):
 
     def _marginalise_before(self, before_ns: int) -> None:
         """Marginalise the states before ``before_ns`` out, but no robot's latest."""
+        if self.most_states is not None:
+            inside = [
+                time
+                for robot, times in self.builder.states.times.items()
+                for time in times[self.builder.oldest[robot] :]
+            ]
+            if len(inside) > self.most_states:
+                before_ns = max(before_ns, sorted(inside)[-self.most_states])
         leaving: list[int] = []
         for robot in self.builder.robots:
             times, oldest = self.builder.states.times[robot], self.builder.oldest[robot]

@@ -69,6 +69,7 @@ class LivePass(Pipeline):
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
         """For the arguments see `LogPass`; the back end has a finite horizon."""
         super().__init__(log, config, known)
+        self.backend.most_states = config.live.max_states
         memory_s = max(self.config.backend.horizon_s, SHORTEST_MEMORY_S)
         self._memory_ns = round(1e9 * memory_s)
         self._known_map = known.known_map

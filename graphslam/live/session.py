@@ -272,6 +272,8 @@ def live_config(config: Config) -> Config:
     horizon = backend.horizon_s if math.isfinite(backend.horizon_s) else config.live.horizon_s
     if horizon <= 0:
         raise ConfigError("live.horizon_s: live estimates need a horizon above 0 s")
+    if config.live.max_states < 2:
+        raise ConfigError("live.max_states: at least two states are needed, of which one is new")
     return replace(config, backend=replace(backend, name="isam2", horizon_s=horizon))
 
 

@@ -218,3 +218,29 @@ def test_a_kept_state_sleeps_again_after_a_closure_and_can_be_dropped():
     assert backend.drop("a", 3 * S)
     assert key not in backend._window.dims
     assert not backend.builder.kept
+
+
+@pytest.mark.parametrize("robots", ["a", "ab"])
+def test_a_window_of_so_many_states_is_one_of_a_shorter_horizon(robots):
+    """A state a second of each robot: of a horizon of 4 s there are five of each. To the bit."""
+    by_number, by_time = smoother(1000.0), smoother(4.0)
+    by_number.most_states = 5 * len(robots)
+    for step in rounds(3, 60, robots):
+        for backend in (by_number, by_time):
+            backend.add(step)
+        for robot in robots:
+            assert np.array_equal(by_number.state_mean(robot), by_time.state_mean(robot))
+    held = [key for key in by_number._window.dims if factors.is_state(key)]
+    # those of the prior that landmarks still tie wait for a block
+    assert len(held) == len([k for k in by_time._window.dims if factors.is_state(k)])
+
+
+def test_the_latest_state_of_each_robot_stays():
+    """However few states there may be."""
+    backend = smoother(1000.0)
+    backend.most_states = 1
+    for step in rounds(3, 20, "ab"):
+        backend.add(step)
+    for robot in "ab":
+        assert np.isfinite(backend.state_mean(robot)).all()
+        assert np.linalg.eigvalsh(backend.joint(robot, []).cov).min() > 0
