@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from graphslam.core.config import Config, RobotConfig
+from graphslam.logs.clock_check import apart
 from graphslam.logs.findings import Finding, Severity
 from graphslam.logs.schemas import (
     JOINT_STATE,
@@ -17,6 +18,7 @@ from graphslam.logs.schemas import (
     POINT_CLOUD,
     SIGHTING,
 )
+from graphslam.logs.time_order import late_remedy
 from graphslam.logs.topic_info import RobotInfo, TopicInfo
 
 #: odometry that never reverses on a longer path is reported
@@ -114,9 +116,11 @@ def _stamps(log: CheckedLog) -> Iterable[Finding]:
             text = f"{topic.duplicates} messages repeat a stamp"
             yield Finding("doubt", "stamps", topic.name, text)
         if topic.too_late:
-            setting = f"--set logs.reorder_s={2 * log.config.logs.reorder_s:g}"
-            text = f"{topic.too_late} messages come too late and are dropped"
-            yield Finding("doubt", "stamps", topic.name, text, f"see logs.reorder_s: {setting}")
+            text = (
+                f"{topic.too_late} messages come up to {topic.latest_s:.1f} s late and are dropped"
+            )
+            remedy = late_remedy(topic.latest_s)
+            yield Finding("doubt", "stamps", topic.name, text, remedy)
 
 
 def _clocks(log: CheckedLog) -> Iterable[Finding]:
@@ -127,14 +131,11 @@ def _clocks(log: CheckedLog) -> Iterable[Finding]:
         for topic in own:
             if moving is None or topic is moving:
                 continue
-            reach_ns = 1e9 * log.config.odometry.max_gap_s
-            a, b = (topic.first_ns or 0, topic.last_ns or 0)
-            c, d = (moving.first_ns or 0, moving.last_ns or 0)
-            if a > d + reach_ns or c > b + reach_ns:
-                apart = 1e-9 * max(a - d, c - b)
-                text = f"its stamps and those of {moving.name} are {apart:.1f} s apart"
-                remedy = "let both be stamped by one clock (use_sim_time for all nodes, or none)"
-                yield Finding("unusable", "clocks", topic.name, text, remedy)
+            span = topic.first_ns or 0, topic.last_ns or 0
+            moved = moving.first_ns or 0, moving.last_ns or 0
+            max_gap_s = log.config.odometry.max_gap_s
+            if found := apart(topic.name, span, moving.name, moved, max_gap_s):
+                yield found
             elif topic.recorded_after_s is not None and moving.recorded_after_s is not None:
                 off = moving.recorded_after_s - topic.recorded_after_s
                 if abs(off) > _SAME_CLOCK_S:

@@ -166,6 +166,7 @@ class _Reading:
     beams: int = 0
     empty_beams: int = 0
     counts: Counter[str] = field(default_factory=Counter)
+    late_s: float = 0.0  # by how much a message came too late, at most
 
     def add_recorded(self, recorded: Iterable[Recorded]) -> Iterator[Recorded]:
         """Count stamps and beams of messages in the order of recording, and pass them on."""
@@ -202,6 +203,7 @@ def _read_topic(
         for message in reader.sorted(reading.add_recorded(recorded)):
             reading.add_sorted(message)
         reading.counts += reader.sorter.counts.get(topic.name, Counter())
+        reading.late_s = max(reading.late_s, reader.sorter.late_s(topic.name))
         dropped.update(reader.dropped)
     return reading
 
@@ -234,6 +236,7 @@ def _topic_info(
         duplicates=reading.counts[time_order.DUPLICATE] + reading.counts[time_order.REPEATED],
         glitches=reading.counts[time_order.GLITCH],
         too_late=reading.counts[time_order.TOO_LATE],
+        latest_s=reading.late_s,
         scan=scan_shape(files, topic) if is_scan else None,
         no_return_m=float(no_return) if is_scan and np.isfinite(no_return) else None,
         dropouts=reading.empty_beams / reading.beams if reading.beams else None,

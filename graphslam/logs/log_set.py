@@ -13,6 +13,7 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Message
 from graphslam.core.worker import Prefetch
 from graphslam.logs import time_order
+from graphslam.logs.clock_check import check_clocks
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded, repair_future_stamps
@@ -270,7 +271,7 @@ class LogSet:
         for reader in readers:
             report.dropped.update(reader.dropped)
             for topic, counts in sorted(reader.sorter.counts.items()):
-                report.warnings.extend(_stamp_warnings(reader.file, topic, counts))
+                report.warnings.extend(_stamp_warnings(reader, topic, counts))
                 for kind in time_order.DROPPED:
                     report.dropped[kind] += counts.pop(kind, 0)
                 report.repaired.update(counts)
@@ -304,7 +305,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
     Raises:
         LogError: a file is missing, of no known container or empty; no topic is usable; all usable
             topics are empty; a robot has sightings but neither odometry nor scans; a laser is
-            tilted too far. The message names file and topic.
+            tilted too far, or its stamps are of another clock. The message names file and topic.
     """
     if not paths:
         raise LogError("no log given; name at least one file or folder")
@@ -325,6 +326,8 @@ def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
             raise LogError(f"{', '.join(str(file.path) for file in files)}: {finding.line}")
     check_separate_times(files, topics, contexts)
     lasers = further_lasers(files, found, topics, config)
+    contexts |= lasers.contexts
+    check_clocks(files, (*topics, *lasers.topics), contexts, config.odometry.max_gap_s)
     wrapped, turns = find_wrapped_wheels(files, topics, contexts)
     gyroscopes, by_gyroscope = find_gyroscopes(files, topics, contexts, config, wrapped)
     found_by = (*derived, *choices, *lasers.findings, *assumed, *turns, *by_gyroscope)
@@ -337,7 +340,7 @@ def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
         dropped=Counter(),
         repaired=Counter(),
         opened=files,
-        _contexts=contexts | lasers.contexts,
+        _contexts=contexts,
         config=config,
         gyroscopes=gyroscopes,
         further_lasers=tuple(lasers.topics),
@@ -432,16 +435,16 @@ def decoded(
 _STAMP_DEFECTS = {
     time_order.GLITCH: "stamps contradict the order of recording; placed between their neighbours",
     time_order.DUPLICATE: "messages repeat a stamp; kept",
-    time_order.TOO_LATE: "messages came too late and were dropped; raise logs.reorder_s to "
-    "keep them",
+    time_order.TOO_LATE: "messages {late}",
     time_order.REPEATED: "increments were recorded twice; the second of each was dropped",
 }
 
 
-def _stamp_warnings(file: Recording, topic: str, counts: Counter[str]) -> list[str]:
+def _stamp_warnings(reader: FileReader, topic: str, counts: Counter[str]) -> list[str]:
     """One line per kind of defect among the stamps of a topic."""
+    late = time_order.late_text(reader.sorter.late_s(topic))
     return [
-        f"{file.path}: {topic}: {counts[kind]} {text}"
+        f"{reader.file.path}: {topic}: {counts[kind]} {text.format(late=late)}"
         for kind, text in _STAMP_DEFECTS.items()
         if counts[kind]
     ]

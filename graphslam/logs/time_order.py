@@ -7,6 +7,7 @@ glitches are detected per topic in the order of recording; then all topics are s
 """
 
 import heapq
+import math
 from collections import Counter, deque
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -22,6 +23,9 @@ REPEATED = "increment: recorded twice"
 REPEATED_SIGHTING = "sighting: recorded twice"
 #: what is counted of messages that are dropped
 DROPPED = (TOO_LATE, REPEATED, REPEATED_SIGHTING)
+
+#: s of lateness up to which a longer window is advised: it has so much of a log in memory
+LONGEST_WINDOW_S = 30.0
 
 # A stamp is compared with at most this many later ones of its topic within the window: an absurd
 # one far in the future would otherwise never leave the window.
@@ -47,6 +51,18 @@ _RANKS: Mapping[type[Message], int] = {
     records.TrueLandmark: 1,
     records.RelativePose: 2,
 }
+
+
+def late_remedy(late_s: float) -> str:
+    """What mends that messages come up to ``late_s`` late by their stamps."""
+    if late_s > LONGEST_WINDOW_S:
+        return "let all topics be stamped by one clock that is not set back"
+    return f"--set logs.reorder_s={math.ceil(late_s + 0.1)} keeps them"
+
+
+def late_text(late_s: float) -> str:
+    """That messages came up to ``late_s`` late, and what mends it."""
+    return f"came up to {late_s:.1f} s late and were dropped; {late_remedy(late_s)}"
 
 
 def recording_times(stamps_ns: Sequence[int]) -> list[int]:
@@ -99,7 +115,13 @@ class MessageSorter:
         self._seen_ns, self._seen = _LONG_AGO, set[Hashable]()  # the sightings of the latest stamp
         self._number = 0
         self._recorded = 0
+        self._late_ns: Counter[str] = Counter()
         self._latest_ns = self._emitted_ns = self._checked_ns = _LONG_AGO
+
+    def late_s(self, topic: str) -> float:
+        """By how much a message of ``topic`` that was `TOO_LATE` came late, at most, s."""
+        repair = self._repairs.get(topic)
+        return 1e-9 * max(self._late_ns[topic], repair.late_ns if repair else 0)
 
     def push(self, topic: str, message: Message) -> Iterable[Message]:
         """Add the next message recorded; those whose order is now final, sorted."""
@@ -139,6 +161,8 @@ class MessageSorter:
             time_ns = message.time_ns
             if time_ns < self._emitted_ns:
                 self.counts[topic][TOO_LATE] += 1
+                late_ns = self._latest_ns - time_ns
+                self._late_ns[topic] = max(late_ns, self._late_ns[topic])
                 continue
             self._latest_ns = max(self._latest_ns, time_ns)
             heapq.heappush(self._heap, (sort_key(message), self._number, topic, message))
@@ -192,6 +216,7 @@ class _GlitchRepair:
         self._settled: deque[int] = deque(maxlen=_LOOK_AHEAD)  # last settled stamps
         self._placed_ns = _LONG_AGO  # latest time of a settled message
         self._placed_number = 0  # its position in the order of recording
+        self.late_ns = 0  # by how much a dropped message was late, at most
 
     @property
     def earliest_ns(self) -> int:
@@ -206,6 +231,8 @@ class _GlitchRepair:
         if stamp_ns < self._placed_ns - self._window_ns:
             # dropped here: as the earliest stamp it would turn all pending ones into glitches
             self._counts[TOO_LATE] += 1
+            late_ns = (stamps[-1] if stamps else self._placed_ns) - stamp_ns
+            self.late_ns = max(self.late_ns, late_ns)
             return []
         if stamps and stamps[-1] == stamp_ns:
             self._counts[DUPLICATE] += isinstance(message, _ONE_PER_STAMP)

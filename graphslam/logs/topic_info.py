@@ -20,10 +20,11 @@ class TopicInfo:
     ``robot`` is None for a topic of unknown schema; ``used``: whether smoothing reads the topic.
     ``rate_hz`` is the mean over the log; ``median_period_s`` is shorter than its inverse if
     messages come in bursts. ``jumps_back`` counts messages stamped earlier than the one recorded
-    before, ``glitches`` those whose stamp is replaced. ``no_return_m`` is the detected range that
-    means no return, ``dropouts`` the share of beams without a usable range. ``recorded_after_s`` is
-    the median time from the stamp of a message to its recording, by the clock of the recorder;
-    ``by_log_time``: the messages have no stamps, and that of their recording is taken.
+    before, ``glitches`` those whose stamp is replaced, ``too_late`` those that are dropped, up to
+    ``latest_s`` late. ``no_return_m`` is the detected range that means no return, ``dropouts`` the
+    share of beams without a usable range. ``recorded_after_s`` is the median time from the stamp of
+    a message to its recording, by the clock of the recorder; ``by_log_time``: the messages have no
+    stamps, and that of their recording is taken.
     """
 
     name: str
@@ -40,6 +41,7 @@ class TopicInfo:
     duplicates: int = 0
     glitches: int = 0
     too_late: int = 0
+    latest_s: float = 0.0
     scan: ScanShape | None = None
     no_return_m: float | None = None
     dropouts: float | None = None

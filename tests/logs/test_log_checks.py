@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
+from graphslam.core.errors import LogError
 from graphslam.logs import LogWriter, inspect_logs, open_logs, schemas
 
 S = 1_000_000_000
@@ -243,3 +244,69 @@ def test_scans_of_two_lasers_on_one_topic_are_not_taken_for_those_of_one(tmp_pat
 )
 def test_bearings_that_may_be_radians_are_read(tmp_path, bearings):
     open_logs([sightings(tmp_path / "log.mcap", bearings)], Config())
+
+
+def test_stamps_of_two_clocks_are_refused_by_smooth_as_by_info(tmp_path):
+    """In no time that both have is there anything to compute but dead reckoning."""
+    path = spoiled(tmp_path, scan_offset_ns=90 * S)
+    (finding,) = inspect_logs([path], Config()).findings
+    done = call("smooth", path, "-o", tmp_path / "out")
+    assert done.code == 1 and check_one_line(done).strip().endswith(finding.line)
+    assert "use_sim_time" in finding.line and not (tmp_path / "out").exists()
+
+
+def test_odometry_on_tf_is_compared_by_its_stamps_not_by_the_times_of_recording(tmp_path):
+    """In a simulation's recording the stamps begin at zero, and a recorder has a clock of its own:
+    nothing is wrong with that. Scans that are stamped by the recorder's clock are refused."""
+    for offset_ns in (0, T0):
+        path = tmp_path / f"{offset_ns}.mcap"
+        with LogWriter(path) as log:
+            log.mount("robot", T0, (0.1, 0, 0))
+            for t in range(S, 20 * S, S // 10):
+                pose = (0.05 * t / S, 0.0, 0.0)
+                log.message("/tf", schemas.TF_MESSAGE, transform(t, pose), T0 + t)
+                shape = {**SCAN, "log_time_ns": T0 + t}
+                log.scan("robot", t + offset_ns, np.full(21, 2.0), **shape)
+        if offset_ns:
+            with pytest.raises(
+                LogError, match=f"/scan: its stamps and those of /tf .* {T0 // S - 19}"
+            ):
+                open_logs([path], Config())
+        else:
+            assert open_logs([path], Config()).robots == ("robot",)
+
+
+def transform(stamp, pose):
+    vector = schemas.build("geometry_msgs/msg/Vector3", x=pose[0], y=pose[1], z=0.0)
+    turn = schemas.build(
+        "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(pose[2] / 2), w=np.cos(pose[2] / 2)
+    )
+    made = schemas.build("geometry_msgs/msg/Transform", translation=vector, rotation=turn)
+    stamped = schemas.build(
+        "geometry_msgs/msg/TransformStamped",
+        header=schemas.header(stamp, "odom"),
+        child_frame_id="base_link",
+        transform=made,
+    )
+    return schemas.build(schemas.TF_MESSAGE, transforms=[stamped])
+
+
+@pytest.mark.parametrize(("back_s", "mended"), [(5, True), (3600, False)])
+def test_a_longer_window_is_advised_where_it_mends_that_messages_come_late(
+    back_s, mended, tmp_path
+):
+    """A clock that is set back by an hour is mended by no window: it would hold the whole log."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.mount("robot", T0, (0.1, 0, 0))
+        for t in range(0, 30 * S, S // 10):
+            stamp = T0 + t - (back_s * S if t > 20 * S else 0)
+            log.odometry("robot", stamp, (0.05 * t / S, 0, 0), log_time_ns=T0 + t)
+            log.scan("robot", stamp, np.full(21, 2.0), log_time_ns=T0 + t, **SCAN)
+    opened = open_logs([path], Config())
+    for _ in opened.messages():
+        pass
+    for lines in (opened.warnings, inspect_logs([path], Config()).warnings):
+        late = [line for line in lines if " late and " in line]
+        assert late and all(("logs.reorder_s" in line) == mended for line in late)
+        assert all(mended or "one clock" in line for line in late)
