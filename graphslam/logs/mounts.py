@@ -1,6 +1,6 @@
 """Sensor mounts in the plane from static transforms."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,16 +46,14 @@ class Mount:
         return level, np.asarray(level[:, 2] + self.height_m > _FLOOR_M)
 
 
-def transform_tree(messages: Iterable[Any]) -> dict[str, tuple[str, Array]]:
-    """All transforms of TFMessages as matrices (4, 4), parent from child; the last one wins."""
-    tree = {}
+def transforms_in(messages: Iterable[Any]) -> Iterator[tuple[str, str, Array]]:
+    """Parent, child and matrix (4, 4), parent from child, of all transforms of TFMessages."""
     for message in messages:
         for stamped in message.transforms:
             parent, child = stamped.header.frame_id, stamped.child_frame_id
             matrix = _matrix(stamped.transform)
             if np.isfinite(matrix).all():
-                tree[child.lstrip("/")] = (parent.lstrip("/"), matrix)
-    return tree
+                yield parent.lstrip("/"), child.lstrip("/"), matrix
 
 
 def find_mount(tree: TransformTree, base: str, sensor: str) -> Mount | None:
@@ -65,11 +63,17 @@ def find_mount(tree: TransformTree, base: str, sensor: str) -> Mount | None:
     """
     if base == sensor:
         return Mount(np.zeros(3), False, 0.0)
+    found = transform_between(tree, base, sensor)
+    return None if found is None else planar_mount(found)
+
+
+def transform_between(tree: TransformTree, base: str, sensor: str) -> Array | None:
+    """The transform (4, 4) base from sensor; None if the tree does not connect them."""
     of_base, of_sensor = _ancestors(tree, base), _ancestors(tree, sensor)
     common = next((frame for frame in of_sensor if frame in of_base), None)
     if common is None:
         return None
-    return planar_mount(np.asarray(np.linalg.solve(of_base[common], of_sensor[common])))
+    return np.asarray(np.linalg.solve(of_base[common], of_sensor[common]))
 
 
 def is_same(one: Mount, other: Mount) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.cdr import HEADER, CdrError, byte_order
-from graphslam.logs.mounts import transform_tree
+from graphslam.logs.mounts import transforms_in
 from graphslam.logs.recording import Recording, raw_messages, sample_messages
 from graphslam.logs.schemas import DEFAULT_ROBOT, TF_MESSAGE
 
@@ -26,6 +26,10 @@ _BLOCKS, _PER_BLOCK = 64, 32
 _AT_REST = 1e-6
 #: m, rad: a transform that is nearly always so near the first one is taken to be that one
 WOBBLE_M, WOBBLE_RAD, WOBBLE_SHARE = 0.05, np.deg2rad(3.0), 0.9
+#: m, rad: static transforms that differ by less are one, as it was rounded
+_ROUNDING_M, _ROUNDING_RAD = 0.005, np.deg2rad(0.3)
+#: transforms of a child that are kept beside the last one: of one that moves there are many
+_MOST_REPLACED = 16
 
 
 class Transform(NamedTuple):
@@ -35,6 +39,30 @@ class Transform(NamedTuple):
     parent: str
     child: str
     values: tuple[float, ...]
+
+
+class StaticTransform(NamedTuple):
+    """A static transform on ``topic``: ``matrix`` (4, 4) is parent from child."""
+
+    topic: str
+    parent: str
+    child: str
+    matrix: Array
+
+    def is_near(self, other: "StaticTransform") -> bool:
+        """Whether it has the same parent as ``other`` and is the same but for rounding."""
+        return self.parent == other.parent and not differ(self.matrix, other.matrix)
+
+
+def differ(one: Array, other: Array) -> tuple[float, float] | None:
+    """By how much two transforms (4, 4) differ, m and rad; None if that is no more than rounding.
+
+    Heights are left out: they mean nothing in the plane.
+    """
+    apart_m = float(np.hypot(*(one - other)[:2, 3]))
+    cosine = (np.trace(one[:3, :3].T @ other[:3, :3]) - 1) / 2
+    apart_rad = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return (apart_m, apart_rad) if apart_m > _ROUNDING_M or apart_rad > _ROUNDING_RAD else None
 
 
 @dataclass(slots=True)
@@ -168,23 +196,35 @@ def decoded(messages: Iterable[bytes]) -> Iterator[list[Transform]]:
 
 
 def static_tree(
-    files: Sequence[Recording], space: str, edges: dict[str, TransformEdge]
+    files: Sequence[Recording],
+    space: str,
+    edges: dict[str, TransformEdge],
+    replaced: dict[str, list[StaticTransform]] | None = None,
 ) -> dict[str, tuple[str, Array]]:
     """Static transforms of a namespace, and those of ``edges`` that do not move, or hardly.
 
-    Child -> (parent, parent_from_child (4, 4)).
+    Child -> (parent, parent_from_child (4, 4)): the last one of each child. ``replaced`` gets, by
+    the child, those of its static ones that another one took the place of.
     """
     tree: dict[str, tuple[str, Array]] = {}
     for child, edge in edges.items():
         matrix = matrix_of(edge.first)
         if (edge.wobbles or not edge.moves) and np.isfinite(matrix).all():
             tree[child] = (edge.parent, matrix)
+    latest: dict[str, StaticTransform] = {}
     for file in files:
         own = [n for n in static_topics(file) if _is_of(n, space)]
-        data = (raw.data for raw in raw_messages(file, own))
-        # a mount that is missing because its message is damaged causes a warning
-        tree |= transform_tree(schemas.decode_all(TF_MESSAGE, data))
-    return tree
+        for raw in raw_messages(file, own):
+            # a mount that is missing because its message is damaged causes a warning
+            for found in transforms_in(schemas.decode_all(TF_MESSAGE, [raw.data])):
+                one = StaticTransform(raw.topic, *found)
+                before = latest.setdefault(one.child, one)
+                if replaced is not None and not before.is_near(one):
+                    others = replaced.setdefault(one.child, [])
+                    if len(others) < _MOST_REPLACED:
+                        others.append(before)
+                latest[one.child] = one
+    return tree | {child: (one.parent, one.matrix) for child, one in latest.items()}
 
 
 def _is_of(topic: str, space: str) -> bool:

@@ -13,6 +13,7 @@ from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.cdr import HEADER, CdrError
+from graphslam.logs.contradictions import contradictions
 from graphslam.logs.decoders import TopicContext, frame_of
 from graphslam.logs.findings import Finding
 from graphslam.logs.mounts import (
@@ -28,13 +29,20 @@ from graphslam.logs.mounts import (
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.point_cloud import cloud_points, sweep_of
 from graphslam.logs.recording import Recording, sample_messages
-from graphslam.logs.tf_tree import TransformEdge, moving_link, sampled_edges, static_tree
+from graphslam.logs.tf_tree import (
+    StaticTransform,
+    TransformEdge,
+    moving_link,
+    sampled_edges,
+    static_tree,
+)
 from graphslam.logs.topics import ODOMETRY_KINDS, Topic
 
 # 16 x 16 messages over the whole log: enough to find a frequent value, quick to read
 _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 16, 16
 #: records that may come without a stamp; increments have two, which must differ
 _STAMPED = (records.Scan, records.Sighting, records.OdometryPose, records.WheelAngles)
+_SENSING = (records.Scan, records.Sighting)
 #: share of the poses in which a base leans that are too many to be bumps
 SHARE_LEANING = 0.05
 #: bearings beyond a whole turn, how many at least and of all: they are no radians
@@ -89,12 +97,13 @@ def topic_contexts(
     by_wheels = {t.robot for t in odometry if t.record is records.WheelAngles}
     by_wheels -= {t.robot for t in odometry if t.record is not records.WheelAngles}
     contexts = {}
-    frames = _SensorFrames(files, config, bases, by_wheels)
+    robots = {t.robot for t in topics if t.count and t.record in (*ODOMETRY_KINDS, *_SENSING)}
+    frames = _SensorFrames(files, config, bases, by_wheels, len(robots))
     for topic in topics:
         settings = config.robot(topic.robot)
         sensor = sensors.get(topic.name, "")
         told: dict[str, Any] = {}
-        if topic.record in (records.Scan, records.Sighting):
+        if topic.record in _SENSING:
             told, notes = frames.context(topic, sensor)
             findings += notes
         if topic.schema == schemas.ODOMETRY:
@@ -132,16 +141,25 @@ class _SensorFrames:
         config: Config,
         bases: Mapping[str, str],
         by_wheels: Collection[str],
+        robots: int,
     ) -> None:
-        """``bases``: robot -> frame that moves; ``by_wheels``: robots whose wheels tell how."""
+        """``bases``: robot -> frame that moves; ``by_wheels``: robots whose wheels tell how.
+
+        ``robots``: how many there are.
+        """
         self._files, self._config, self._bases = files, config, bases
         self._by_wheels = by_wheels
+        self._robots = robots
         self._trees: dict[str, tuple[dict[str, TransformEdge], TransformTree]] = {}
+        self._replaced: dict[str, dict[str, list[StaticTransform]]] = {}
 
     def _transforms(self, robot: str) -> tuple[dict[str, TransformEdge], TransformTree]:
         if robot not in self._trees:
-            edges = sampled_edges(self._files, robot)
-            self._trees[robot] = edges, static_tree(self._files, robot, edges)
+            edges, replaced = (
+                sampled_edges(self._files, robot),
+                self._replaced.setdefault(robot, {}),
+            )
+            self._trees[robot] = edges, static_tree(self._files, robot, edges, replaced)
         return self._trees[robot]
 
     def context(self, topic: Topic, sensor: str) -> tuple[dict[str, Any], list[Finding]]:
@@ -176,6 +194,11 @@ class _SensorFrames:
             elif mount.inverted:
                 inverted.add(frame)
             findings += notes
+            if not (is_scan and laser):
+                where, setting = _names(topic, sensor, frame)
+                replaced = self._replaced[topic.robot]
+                told_by = (base, frame), tree, replaced, self._robots
+                findings += contradictions(where, *told_by, setting if is_scan else "")
         told: dict[str, Any] = {
             "mounts": mounts, "inverted": frozenset(inverted), "tilted": tilted, "only_frame": only
         }  # fmt: skip
@@ -295,6 +318,13 @@ def base_frame(files: Sequence[Recording], topic: Topic) -> str:
     return "base_link"
 
 
+def _names(topic: Topic, sensor: str, frame: str) -> tuple[str, str]:
+    """How findings name a sensor in ``frame``, and the option that states its mount."""
+    key = f"lasers.{sensor}" if sensor else "laser"
+    setting = f"--set 'robots.{topic.robot}.{key}=[X, Y, YAW]' (m, m, rad)"
+    return f"{topic.name}: frame {frame or '(none)'}", setting
+
+
 def _mount(
     topic: Topic,
     tree: TransformTree,
@@ -307,9 +337,7 @@ def _mount(
     ``of``: its name, if it is a further laser, its frame, and what moves between it and the base.
     """
     sensor, frame, link = of
-    where = f"{topic.name}: frame {frame or '(none)'}"
-    key = f"lasers.{sensor}" if sensor else "laser"
-    setting = f"--set 'robots.{topic.robot}.{key}=[X, Y, YAW]' (m, m, rad)"
+    where, setting = _names(topic, sensor, frame)
     found = find_mount(tree, base, frame)
     inverted = found is not None and found.inverted
     if len(configured) == 3 and topic.record is records.Scan:
