@@ -8,9 +8,10 @@ from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.suggestions import did_you_mean
+from graphslam.logs import schemas
 from graphslam.logs.decoders import DECODERS
 from graphslam.logs.findings import Finding, topics_setting
-from graphslam.logs.recording import Recording
+from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.schemas import POINT_CLOUD
 from graphslam.logs.tf_tree import namespace_of
 
@@ -23,6 +24,9 @@ ODOMETRY_KINDS: tuple[type[records.Message], ...] = (
 )
 # What tells how a robot moved: without odometry its scans, compared with each other.
 MOTION_KINDS = (*ODOMETRY_KINDS, records.Scan)
+
+#: last part of the name of a frame, in which poses jump by REP 105
+_JUMPING_FRAMES = ("map", "world", "earth")
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +134,7 @@ def choose_topics(
     for robot in sorted({topic.robot for topic in filled}):
         own = [topic for topic in filled if topic.robot == robot]
         own.sort(key=lambda t: (t.schema == POINT_CLOUD, -t.count, t.name))
-        odometry = [t for kind in ODOMETRY_KINDS for t in own if t.record is kind]
+        odometry = _odometry_of(files, own)
         lasers = lasers_of(filled, robot)
         sensors = lasers + [t for t in own if t.record is records.Sighting]
         if sensors and not odometry:
@@ -162,6 +166,29 @@ def choose_topics(
         )
     findings += [unused("odometry", own, chosen) for own in spare if len(own) > 1]
     return chosen, findings
+
+
+def _odometry_of(files: Sequence[Recording], topics: Sequence[Topic]) -> list[Topic]:
+    """The sources of odometry among a robot's ``topics``, the one first that is used.
+
+    Of poses those in a frame that does not jump (REP 105) come first, else the order is kept.
+    """
+    poses = [topic for topic in topics if topic.record is records.OdometryPose]
+    if len(poses) > 1:
+        poses.sort(key=lambda topic: _jumps(files, topic))
+    of_kind = {kind: [t for t in topics if t.record is kind] for kind in ODOMETRY_KINDS}
+    of_kind[records.OdometryPose] = poses
+    return [topic for own in of_kind.values() for topic in own]
+
+
+def _jumps(files: Sequence[Recording], topic: Topic) -> bool:
+    """Whether poses are in a frame that jumps where a robot finds out where it is."""
+    for file in files:
+        first = sample_messages(file, topic.name, 1, 1)
+        for message in schemas.decode_all(topic.schema, first):
+            frame = message.header.frame_id.rstrip("/").rpartition("/")[2]
+            return frame.lower() in _JUMPING_FRAMES
+    return False
 
 
 def lasers_of(topics: Sequence[Topic], robot: str) -> list[Topic]:

@@ -260,6 +260,40 @@ def test_two_odometries_of_one_body_are_one_robot(room, tmp_path):
     assert "/odom" in unused and "/odometry/filtered" in unused
 
 
+@pytest.mark.parametrize(
+    ("frames", "used"),
+    [
+        (("odom", "map"), "/odom"),
+        (("a/odom", "/a/Map"), "/odom"),
+        (("odom", "world"), "/odom"),
+        (("odom", "robot_odom_filtered"), "/localization/odom"),
+        (("map", "world"), "/localization/odom"),
+    ],
+)
+def test_odometry_in_a_frame_that_jumps_is_used_only_where_there_is_no_other(
+    frames, used, tmp_path
+):
+    """By REP 105 a robot jumps in map when it is localised; else the one with more messages."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        for k in range(40):
+            own = ("/odom", frames[0]), ("/localization/odom", frames[1])
+            for topic, frame in own[k % 2 :]:  # every second message of the other one alone
+                data = schemas.build(
+                    schemas.ODOMETRY,
+                    header=schemas.header(START_NS + k * S // 20, frame),
+                    child_frame_id="base_link",
+                    pose=_pose_of(np.array([0.01 * k, 0.0, 0.0])),
+                    twist=_no_twist(),
+                )
+                log.message(topic, schemas.ODOMETRY, data, START_NS + k * S // 20)
+            log.scan("robot", START_NS + k * S // 20, np.full(len(BEAMS), 2.0), **SCAN)
+    chosen = {topic.name for topic in open_logs([path], Config()).topics}
+    assert chosen == {used, "/scan"}
+    info = {topic.name: topic.used for topic in inspect_logs([path], Config()).topics}
+    assert {name for name, is_used in info.items() if is_used} == chosen
+
+
 def test_without_any_tf_one_of_each_is_one_robot(room, tmp_path):
     class Bare(Robot):
         def transforms(self, *_):
