@@ -15,7 +15,7 @@ from graphslam.core.consistency import fit_rigid_transform, poses_differ
 from graphslam.core.geometry import Array, compose, transform, unit_vectors, wrap
 from graphslam.core.records import Landmark, TrueLandmark
 from graphslam.evaluation.landmark_metrics import MATCH_DISTANCE_M
-from graphslam.evaluation.trajectory_metrics import PosePairs, align
+from graphslam.evaluation.trajectory_metrics import PosePairs, align, align_poses, displacement
 
 #: m, m, rad: how exact a sample of a true pose is taken to be
 TRUTH_SIGMA = (0.01, 0.01, 0.01)
@@ -62,21 +62,18 @@ def is_common_frame(config: Config, pairs: Mapping[str, PosePairs], world: str |
 
 
 def alignment_of_poses(pairs: Sequence[PosePairs]) -> Alignment:
-    """By the positions of all poses, see `align`."""
-    true, own = (np.concatenate([getattr(p, name)[:, :2] for p in pairs]) for name in _SIDES)
-    return Alignment(align(true, own), "poses")
+    """By the positions of all poses, see `align_poses`."""
+    return Alignment(align_poses(*_sides(pairs)), "poses")
 
 
 def displacement_of_poses(pairs: Sequence[PosePairs]) -> Alignment:
     """By positions and headings of all poses: also that of robots that hardly moved."""
-    true, own = (np.concatenate([getattr(p, name) for p in pairs]) for name in _SIDES)
-    turn = np.exp(1j * (own[:, 2] - true[:, 2])).mean()
-    pose = np.array([0.0, 0.0, np.angle(turn)])
-    pose[:2] = np.mean(own[:, :2] - transform(pose, true[:, :2]), axis=0)
-    return Alignment(pose, "poses")
+    return Alignment(displacement(*_sides(pairs)), "poses")
 
 
-_SIDES = ("truth", "estimate")
+def _sides(pairs: Sequence[PosePairs]) -> list[Array]:
+    """All true poses (n, 3), and all estimated ones (n, 3)."""
+    return [np.concatenate([getattr(p, side) for p in pairs]) for side in ("truth", "estimate")]
 
 
 def alignment_of_landmarks(

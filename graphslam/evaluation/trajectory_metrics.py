@@ -17,6 +17,8 @@ from graphslam.evaluation.error_statistics import nees_statistics, rms
 
 #: true poses farther apart than this in time are not interpolated between
 MAX_TRUTH_GAP_S = 1.0
+#: m: a path of less extent, and the share of it, left of positions, by which they tell no direction
+_STANDING_M, _NOISE_SHARE = 0.1, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +61,32 @@ def align(source: Array, target: Array) -> Array:
     Least squares over positions, all with the same weight.
     """
     return fit_rigid_transform(target, source, np.ones(len(source)))[0]
+
+
+def displacement(source: Array, target: Array) -> Array:
+    """Pose (3,) that moves poses ``source`` (n, 3) onto ``target`` (n, 3), on average.
+
+    By their headings, and by positions once these are turned.
+    """
+    turn = np.exp(1j * (target[:, 2] - source[:, 2])).mean()
+    pose = np.array([0.0, 0.0, np.angle(turn)])
+    pose[:2] = np.mean(target[:, :2] - transform(pose, source[:, :2]), axis=0)
+    return pose
+
+
+def align_poses(source: Array, target: Array) -> Array:
+    """Pose (3,) that moves poses ``source`` (n, 3) best onto ``target`` (n, 3), see `align`.
+
+    Where a robot stands all the time the noise of its positions tells no direction: then it is the
+    `displacement`.
+    """
+    pose = align(source[:, :2], target[:, :2])
+    extent = np.std(target[:, :2], axis=0)
+    left = target[:, :2] - transform(pose, source[:, :2])
+    extent_m, left_m = float(np.hypot(*extent)), float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+    if extent_m < _STANDING_M and left_m >= _NOISE_SHARE * extent_m:
+        return displacement(source, target)
+    return pose
 
 
 def relative_errors(
@@ -110,7 +138,7 @@ def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
     """All trajectory numbers of one robot, or of several under one common alignment.
 
     Absolute errors: ``ate_rmse_m``, ``max_m`` and ``heading_rmse_rad`` as estimated, those that are
-    called aligned after one `align` of all positions. Consistency is of the poses as estimated.
+    called aligned after one `align_poses` of all. Consistency is of the poses as estimated.
     ``rpe`` as in `relative_errors`, over 1 s and over 10 m. A number without data is None, as are
     the aligned ones of a single pose.
 
@@ -125,7 +153,7 @@ def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
     errors[:, 2] = wrap(errors[:, 2])
     ends = np.cumsum([len(p) for p in robots])[:-1]
     distance = np.hypot(errors[:, 0], errors[:, 1])
-    alignment = align(estimate[:, :2], truth[:, :2])
+    alignment = align_poses(estimate, truth)
     left = np.hypot(*(transform(alignment, estimate[:, :2]) - truth[:, :2]).T)
     spans: dict[str, dict[str, float]] = {"1_s": {"seconds": 1.0}, "10_m": {"metres": 10.0}}
     rpe = {

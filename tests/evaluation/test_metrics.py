@@ -101,6 +101,30 @@ def test_alignment_beats_every_nearby_motion():
         assert cost(best) < cost(best + nudge)
 
 
+@pytest.mark.parametrize("noise_m", [0.0, 1e-9, 0.002])
+def test_a_robot_that_stands_is_aligned_by_its_heading(noise_m):
+    """Its positions tell no direction: by them alone a good estimate was up to 180° off."""
+    rng = np.random.default_rng(3)
+    stamps = START_NS + S // 10 * np.arange(60)
+    truth = trajectory(stamps, np.tile([21.5, 17.9, np.pi], (60, 1)))
+    noise = np.column_stack([rng.normal(0, noise_m, (60, 2)), rng.normal(0, 0.001, 60)])
+    own = trajectory(stamps, noise)  # its frame begins where it stands
+    found = trajectory_metrics([pair_poses(own, truth)])
+    assert found["heading_aligned_rmse_rad"] < 0.002
+    assert found["ate_aligned_rmse_m"] <= 2 * noise_m + 1e-9
+
+
+def test_a_short_way_that_is_known_well_is_aligned_by_its_positions():
+    """A few centimetres tell the direction to which a heading that is off is compared."""
+    truth = circle(60)
+    truth = trajectory(truth.stamps_ns, truth.poses * [0.005, 0.005, 1.0])
+    pose = np.array([3.0, 4.0, 2.0])
+    off = trajectory(truth.stamps_ns, compose(pose, truth.poses) + np.array([0, 0, 0.1]))
+    found = trajectory_metrics([pair_poses(off, truth)])
+    assert found["heading_aligned_rmse_rad"] == pytest.approx(0.1, abs=1e-9)
+    assert found["ate_aligned_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_shifted_trajectory_has_that_error_and_none_aligned():
     truth = circle(50)
     pose = np.array([3.0, 4.0, 0.0])
