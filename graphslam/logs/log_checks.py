@@ -6,6 +6,7 @@ Every check reads the description of a log and tells what it found, with what me
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from shlex import quote
 
 from graphslam.core.config import Config, RobotConfig
 from graphslam.logs.clock_check import apart
@@ -31,6 +32,8 @@ _SLOW_ODOMETRY_S, _SLOW_SCANS_S = 0.5, 1.5
 _BLIND = 0.95
 #: s by which the delays of two topics may differ before their clocks do
 _SAME_CLOCK_S = 0.5
+#: names of joints that are listed
+_MOST_NAMES = 12
 
 _MOVING = (ODOMETRY, ODOMETRY_INCREMENT, JOINT_STATE)
 _SCANS = (LASER_SCAN, POINT_CLOUD)
@@ -101,7 +104,30 @@ def _unreadable(log: CheckedLog) -> Iterable[Finding]:
                 if other.used and other.schema in _MOVING
             )
             how: Severity = "doubt" if others or topic.schema not in _MOVING else "unusable"
-            yield Finding(how, "messages", topic.name, text, "check what publishes it")
+            remedy = _name_wheels(topic, log.config.robot(topic.robot)) if topic.joints else ""
+            if remedy:
+                text += f"; its joints are {_listed(topic.joints)}"
+            remedy = remedy or "check what publishes it"
+            yield Finding(how, "messages", topic.name, text, remedy)
+
+
+def _name_wheels(topic: TopicInfo, settings: RobotConfig) -> str:
+    """The options that name the wheels among joints; empty if it is known which these are."""
+    options, known = [], []
+    for side, set_to in (("left", settings.left_joint), ("right", settings.right_joint)):
+        named = [joint for joint in topic.joints if side in joint.lower()]
+        known.append(set_to in topic.joints if set_to else len(named) == 1)
+        joint = named[0] if named else "NAME"
+        options.append("--set " + quote(f"robots.{topic.robot}.{side}_joint={joint}"))
+    if all(known):
+        return ""
+    return f"name a wheel of each side: {' '.join(options)}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    more = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _stamps(log: CheckedLog) -> Iterable[Finding]:
@@ -230,7 +256,8 @@ def _wheels(log: CheckedLog) -> Iterable[Finding]:
             values = f"wheels of {default.wheel_radius_left_m:g} m radius, {default.axle_m:g} m "
             text = f"the wheels' geometry is not known; {values}apart are assumed"
             remedy = " ".join(
-                f"--set robots.{topic.robot}.{name}={getattr(default, name):g}" for name in names
+                "--set " + quote(f"robots.{topic.robot}.{name}={getattr(default, name):g}")
+                for name in names
             )
             yield Finding("doubt", "wheels", topic.name, text, f"give what it is: {remedy}")
 

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from graphslam.core import records
 from graphslam.core.config import Config, RobotConfig
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between
-from graphslam.logs import time_order
+from graphslam.logs import schemas, time_order
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded
@@ -21,7 +22,7 @@ from graphslam.logs.gyroscopes import find_gyroscopes
 from graphslam.logs.lasers import FurtherLasers, further_lasers
 from graphslam.logs.log_checks import CheckedLog, by_severity, check_log
 from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
-from graphslam.logs.recording import Recording
+from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.separate_times import check_separate_times
 from graphslam.logs.sessions import open_recordings
@@ -37,6 +38,7 @@ from graphslam.logs.topics import (
 from graphslam.logs.wheel_turns import find_wrapped_wheels
 
 _GAP_PERIODS, _GAP_S = 10, 1.0  # a gap is longer than both: 10 periods of the topic and 1 s
+_FIRST_JOINTS = 1000  # messages of which the names of joints are listed
 _REVERSING_M = 1e-3  # smallest backward step; larger than the noise of a robot at rest
 
 
@@ -216,7 +218,8 @@ def _topic_info(
     contexts: Mapping[str, TopicContext],
 ) -> TopicInfo:
     if reading is None or not reading.times_ns:
-        return TopicInfo(topic.name, topic.schema, topic.robot, used, topic.count)
+        joints = _joints(files, topic) if topic.record is records.WheelAngles else ()
+        return TopicInfo(topic.name, topic.schema, topic.robot, used, topic.count, joints=joints)
     times = np.sort(np.array(reading.times_ns, dtype=np.int64))
     span_s, period_s = float(times[-1] - times[0]) * 1e-9, _median_period_s(times)
     no_return = contexts[topic.name].no_return_m
@@ -243,6 +246,16 @@ def _topic_info(
         recorded_after_s=float(np.median(reading.delays_ns)) * 1e-9,
         by_log_time=contexts[topic.name].by_log_time,
     )
+
+
+def _joints(files: Sequence[Recording], topic: Topic) -> tuple[str, ...]:
+    """The names of joints in the first messages, sorted; all of these: publishers may alternate."""
+    names: set[str] = set()
+    for file in files:
+        data = (raw.data for raw in islice(raw_messages(file, (topic.name,)), _FIRST_JOINTS))
+        for message in schemas.decode_all(topic.schema, data):
+            names.update(map(str, message.name))
+    return tuple(sorted(names))
 
 
 def _median_period_s(times_ns: NDArray[np.int64]) -> float:

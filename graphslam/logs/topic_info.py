@@ -24,7 +24,8 @@ class TopicInfo:
     ``latest_s`` late. ``no_return_m`` is the detected range that means no return, ``dropouts`` the
     share of beams without a usable range. ``recorded_after_s`` is the median time from the stamp of
     a message to its recording, by the clock of the recorder; ``by_log_time``: the messages have no
-    stamps, and that of their recording is taken.
+    stamps, and that of their recording is taken. ``joints`` are the names in a JointState of which
+    no message can be used.
     """
 
     name: str
@@ -47,6 +48,7 @@ class TopicInfo:
     dropouts: float | None = None
     recorded_after_s: float | None = None
     by_log_time: bool = False
+    joints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,8 @@
 """`info` as a doctor: what keeps a log from being used well is found, with what mends it."""
 
+import itertools
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -310,3 +312,51 @@ def test_a_longer_window_is_advised_where_it_mends_that_messages_come_late(
         late = [line for line in lines if " late and " in line]
         assert late and all(("logs.reorder_s" in line) == mended for line in late)
         assert all(mended or "one clock" in line for line in late)
+
+
+def joints(path, names):
+    """A drive of a robot whose wheels, ``names``, turn alike; an arm is on the same topic."""
+    with LogWriter(path) as log:
+        log.mount("robot", T0, (0.1, 0, 0))
+        for k in range(60):
+            stamp = T0 + k * S // 10
+            for own in (names, ["arm_joint"]):
+                message = schemas.build(
+                    schemas.JOINT_STATE,
+                    header=schemas.header(stamp, ""),
+                    name=own[:: (-1) ** k],  # in no certain order
+                    position=np.full(len(own), 0.1 * k),
+                    velocity=np.zeros(0),
+                    effort=np.zeros(0),
+                )
+                log.message("/joint_states", schemas.JOINT_STATE, message, stamp)
+            log.scan("robot", stamp, np.full(21, 2.0), **SCAN)
+    return path
+
+
+@pytest.mark.parametrize("robot", ["robot", "Ü b"])
+def test_joints_of_four_wheels_are_listed_with_the_options_that_name_two(robot, tmp_path):
+    wheels = [f"{place}_{side}_wheel" for place in ("rear", "front") for side in ("left", "right")]
+    path = joints(tmp_path / "log.mcap", wheels)
+    topics = f'logs.topics={{"/scan" = "{robot}", "/joint_states" = "{robot}"}}'
+    info = inspect_logs([path], load_config(None, [topics]))
+    (found,) = [f for f in info.findings if f.severity == "unusable"]
+    assert all(name in found.text for name in [*wheels, "arm_joint"])
+    options = shlex.split(found.remedy)
+    settings = [after for option, after in itertools.pairwise(options) if option == "--set"]
+    assert settings == [
+        f"robots.{robot}.left_joint=front_left_wheel",
+        f"robots.{robot}.right_joint=front_right_wheel",
+    ]
+    mended = inspect_logs([path], load_config(None, [topics, *settings]))
+    assert mended.usable and [one.path_m for one in mended.robots if one.name == robot] != [None]
+
+
+def test_joints_that_are_no_wheels_are_listed_and_known_wheels_are_not(tmp_path):
+    info = inspect_logs([joints(tmp_path / "a.mcap", ["slide_1", "slide_2"])], Config())
+    (found,) = [f for f in info.findings if f.severity == "unusable"]
+    assert "arm_joint, slide_1, slide_2" in found.text
+    assert "robots.robot.left_joint=NAME" in found.remedy
+    assert inspect_logs(
+        [joints(tmp_path / "b.mcap", ["wheel_left", "wheel_right"])], Config()
+    ).usable
