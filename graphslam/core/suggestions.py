@@ -1,6 +1,7 @@
-"""What was probably meant by a name that is not known."""
+"""What to type instead: a name that is not known, an option with its value."""
 
 from collections.abc import Iterable
+from shlex import quote
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -9,3 +10,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
     close = difflib.get_close_matches(name, list(known), n=1)
     return f"; did you mean {close[0]}?" if close else ""
+
+
+def start_option(robot: str) -> str:
+    """The option that says where ``robot`` starts, as a shell takes it: names may have blanks."""
+    return f"--start {quote(f'{robot}=x,y,phi')}"

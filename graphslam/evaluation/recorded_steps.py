@@ -11,6 +11,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError, LogError
 from graphslam.core.geometry import Array
 from graphslam.core.records import Step
+from graphslam.core.suggestions import start_option
 from graphslam.estimation.replay import Replay
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_map import LandmarkMap
@@ -122,7 +123,7 @@ def record_steps(
     if apart:
         raise EstimationError(
             f"robot {min(apart)}: its start is unknown and cannot be found from the log; "
-            f"back ends are compared in one frame: give --start {min(apart)}=x,y,phi"
+            f"back ends are compared in one frame: give {start_option(min(apart))}"
         )
     runs = {name: run for name, run in sorted(pipeline.runs.items()) if run.started}
     return RecordedSteps(

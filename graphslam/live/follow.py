@@ -14,6 +14,7 @@ from graphslam.core.config_io import chosen_config
 from graphslam.core.errors import LogError
 from graphslam.core.output_folder import Identity, identity
 from graphslam.core.records import Landmark, Message
+from graphslam.core.suggestions import start_option
 from graphslam.core.worker import Future
 from graphslam.live.history import History
 from graphslam.live.live_folder import write_live_folder
@@ -288,7 +289,7 @@ def _unplaced(session: Session) -> list[str]:
     """A line for each robot that nothing relates to the first one."""
     return [
         f"{robot}: its start is not known, so it has a frame of its own; "
-        f"give --start {robot}=x,y,phi (m, rad)"
+        f"give {start_option(robot)} (m, rad)"
         for robot, frame in session.frames.items()
         if frame != session.world
     ]

@@ -13,6 +13,7 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import chosen_config
 from graphslam.core.errors import ConfigError, EstimationError, LogError
 from graphslam.core.records import Landmark, Message, Scan, Sighting
+from graphslam.core.suggestions import start_option
 from graphslam.live.live_pass import LiveEstimate, LivePass
 from graphslam.logs import LogSet
 from graphslam.logs.decoders import TopicContext
@@ -346,7 +347,7 @@ def known_starts(log: LogSet, config: Config) -> PriorKnowledge:
     if known_map is not None and missing:
         raise EstimationError(
             f"robot {missing[0]}: live estimates in the map {known_map.name} need its start; give "
-            f"--start {missing[0]}=x,y,phi (m, rad), or smooth the recording, which finds it"
+            f"{start_option(missing[0])} (m, rad), or smooth the recording, which finds it"
         )
     world = min(starts)
     frames = {robot: world if robot in starts else robot for robot in log.robots}

@@ -16,6 +16,7 @@ from graphslam.core.gaussian import chi2_quantile, symmetric
 from graphslam.core.geometry import between, compose, compose_cov, inverse, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Start
+from graphslam.core.suggestions import start_option
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.submaps import SubmapPose, submaps_at, with_poses_from
@@ -160,7 +161,7 @@ def found_start(
             return found[best]
     raise EstimationError(
         f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; give "
-        f"another map, or --start {robot}=x,y,phi (m, rad)"
+        f"another map, or {start_option(robot)} (m, rad)"
     )
 
 

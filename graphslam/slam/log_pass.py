@@ -11,6 +11,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import rotate_cov
 from graphslam.core.records import Association, KeyframeScan, Sighting, Start, Step
+from graphslam.core.suggestions import start_option
 from graphslam.logs import LogSet
 from graphslam.logs.clock import Clock
 from graphslam.mapping.known_map import KnownMap
@@ -114,7 +115,7 @@ class LogPass:
         """
         if robot not in self.starts:
             raise EstimationError(
-                f"robot {robot}: its start is unknown; give --start {robot}=x,y,phi (m, rad) or "
+                f"robot {robot}: its start is unknown; give {start_option(robot)} (m, rad) or "
                 "--start truth"
             )
         start = self.frames.offset_start(robot, self.starts[robot])

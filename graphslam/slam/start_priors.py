@@ -6,6 +6,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.records import OdometryIncrement, Scan, Sighting, Start, Truth
+from graphslam.core.suggestions import start_option
 from graphslam.logs import LogSet
 from graphslam.odometry.preintegration import Track
 from graphslam.slam.robot_settings import robot_settings
@@ -101,7 +102,7 @@ def first_truth(log: LogSet, config: Config | None = None) -> dict[str, Array]:
         if abs(truth.time_ns - begin) > MAX_TRUTH_LAG_NS:
             raise EstimationError(
                 f"--start truth: {robot} starts at {begin} ns and its truth nearest to that is of "
-                f"{truth.time_ns} ns; give --start {robot}=x,y,phi"
+                f"{truth.time_ns} ns; give {start_option(robot)}"
             )
         poses[robot] = _moved(truth, begin, tracks[robot])
     return poses

@@ -16,6 +16,7 @@ from graphslam.core.config import RobotConfig
 from graphslam.core.config_io import dump_config
 from graphslam.core.geometry import compose
 from graphslam.core.records import Estimate
+from graphslam.core.suggestions import start_option
 from graphslam.estimation.clock_calibration import ClockEstimate
 from graphslam.logs import LogSet
 from graphslam.odometry.several_lasers import SeveralLasersTrack
@@ -346,7 +347,7 @@ def run_warnings(pipeline: LogPass) -> list[str]:
     warnings += [
         f"{robot}: {_why_apart(pipeline, robot)}; "
         "its poses are in a separate frame with its origin at its first pose; "
-        f"--start {robot}=x,y,phi places it"
+        f"{start_option(robot)} places it"
         for robot in _apart(pipeline)
     ]
     warnings += [f"{name}: {said}" for name, said in known.frame_assignment.remarks.items()]

@@ -1,6 +1,7 @@
 """The pipeline on small logs whose truth is known: what comes out, at which stamps, and why."""
 
 import importlib
+import shlex
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from room_log import drive
 from walls import cast, rectangles
 
 import graphslam
+from graphslam.cli.arguments import check_start
 from graphslam.core.config import Config, OdometryConfig, RobotConfig, StartConfig
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import EstimationError, GraphSlamError
@@ -409,6 +411,21 @@ def test_a_start_that_nothing_tells_is_said_with_what_to_do(meeting):
     ]
     assert "separate frame" in told
     assert "--start b=x,y,phi" in told
+
+
+def test_the_option_that_places_a_robot_is_one_for_a_shell_whatever_its_name(tmp_path):
+    path, robots = tmp_path / "log.mcap", ("a", "Ü b's")
+    with LogWriter(path) as log:
+        for k in range(20):
+            for robot in robots:  # each sees a landmark of its own
+                log.odometry(robot, S + k * S // 5, (0.1 * k, 0, 0))
+                z = (0.0, 5.0 - 0.1 * k)
+                log.sighting(robot, S + k * S // 5, z, np.eye(2) * 1e-3, identity=robot)
+    (told,) = [line for line in run(path).summary["warnings"] if "separate frame" in line]
+    words = shlex.split(told[told.index("--start ") :])
+    (setting,) = check_start([words[1].replace("x,y,phi", "1,2,3")])
+    placed = run(path, "start.poses.a=[0, 0, 0]", setting)
+    assert_same_pose(placed.robots[robots[1]].final.poses[0], np.array([1, 2, 3]), atol=1e-6)
 
 
 @pytest.mark.parametrize("pose", ["[1, 2]", "[1, 2, 3, 4]"])
