@@ -22,6 +22,7 @@ from graphslam.slam.log_pass import LogPass
 from graphslam.slam.path_evidence import NO_PATH, PathMisfits
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.scan_evidence import Parked, gather_scan_evidence
+from graphslam.slam.sweep_skew import NO_SKEW, SweepSkew, by_robot, sweep_skew
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 IntTable = np.ndarray[tuple[int, int], np.dtype[np.int64]]
@@ -82,7 +83,8 @@ class RobotEvidence:
     another one there; ``bridged_sigma_m``: of its position where scans were all that told;
     ``missing``: what increments of its odometry leave out;
     ``lost_ns`` (l, 2): times of consecutive scans that have nothing in common, see `ComparedScans`;
-    ``curved``: share of what it saw of walls, see `curved_share`.
+    ``curved``: share of what it saw of walls, see `curved_share`; ``skew``: how its walls are
+    turned within scans.
     """
 
     name: str
@@ -104,6 +106,7 @@ class RobotEvidence:
     missing: MissingIncrements = field(default_factory=MissingIncrements)
     lost_ns: IntTable = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     curved: float = 0.0
+    skew: SweepSkew = NO_SKEW
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,6 +142,7 @@ def gather(
     found = []
     entries = pipeline.landmarks.entries.items()
     identities: dict[int | str, str] = {i: one.identity or "" for i, one in entries}
+    scans = by_robot(pipeline.keyframe_scans)
     by_scans = pipeline.scan_evidence or gather_scan_evidence(pipeline, estimate)
     for name, run in pipeline.started.items():
         motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
@@ -167,6 +171,7 @@ def gather(
                 bridged_sigma_m=run.track.bridged_sigma_m,
                 lost_ns=np.array(run.lost, dtype=np.int64).reshape(-1, 2),
                 curved=curved_share(own),
+                skew=sweep_skew(own, scans.get(name, []), estimate, run.track),
             )
         )
     observed = any(step.associations or step.closures for step in steps)

@@ -18,6 +18,9 @@ HOPS = 0.3
 CONTRADICTED, IN_A_ROW, ROW = 0.12, 8, 12
 #: share of what was seen of walls that is of curves: of Intel and ACES up to 0.04
 CURVED = 0.15
+#: sigmas, share of the squared residuals, and rad: of walls turned within scans by a sweep; of
+#: healthy logs up to 7 sigmas, 0.03 and 0.004 rad
+SKEW_SIGMAS, SKEW_SHARE, SKEW_RAD = 10.0, 0.1, 0.005
 #: ns without a scan, and usual times between two, in which a robot may be carried
 UNSEEN_NS, UNSEEN_SCANS = 1_000_000_000, 3
 #: ns without a scan in which a robot may stop and start again; m and rad that one which drives
@@ -35,6 +38,7 @@ def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
             yield from _moved_unseen(robot, evidence)
             yield from _stood_unseen(robot, evidence)
             yield from _curved(robot)
+            yield from _skewed(robot)
 
 
 def _repeated(robot: RobotEvidence) -> Iterator[Reason]:
@@ -138,6 +142,19 @@ def _curved(robot: RobotEvidence) -> Iterator[Reason]:
             "they are mapped as straight pieces, which move along with the robot: its path may be "
             "too short, or turned, by far more than is stated; front_end.name=none goes by "
             "odometry instead"
+        )
+        yield Reason("doubtful", "scans", robot.name, text)
+
+
+def _skewed(robot: RobotEvidence) -> Iterator[Reason]:
+    skew = robot.skew
+    if skew.sigmas > SKEW_SIGMAS and skew.share > SKEW_SHARE and skew.rms_rad > SKEW_RAD:
+        text = (
+            f"{robot.name}: where it turns, the walls of a scan are turned against each other, as "
+            f"by beams that are measured one after the other in {abs(skew.sweep_s):.2f} s or more "
+            "and are taken as if otherwise: the map may be wrong by far more than is stated; set "
+            "time_increment of the scans, leave logs.undistort on, see docs/logs.md, Motion during "
+            "a sweep"
         )
         yield Reason("doubtful", "scans", robot.name, text)
 

@@ -14,6 +14,7 @@ from graphslam.slam.evidence import ClosureMisfits, Evidence, RobotEvidence, See
 from graphslam.slam.moved_points import moved_doubts
 from graphslam.slam.path_evidence import FACTORS, PathMisfits
 from graphslam.slam.scan_evidence import Parked, _half_changed
+from graphslam.slam.sweep_skew import SweepSkew
 from graphslam.slam.verdict import judge, with_truth
 
 S = 1_000_000_000
@@ -195,6 +196,10 @@ WRONG = {
     "curved walls": (
         lambda: evidence(scans=True, seen=no_sightings, curved=0.3),
         "30 % of what it saw of walls is of curved ones",
+    ),
+    "a sweep that nobody told of": (
+        lambda: evidence(scans=True, seen=no_sightings, skew=SweepSkew(0.04, 30.0, 0.3, 0.013)),
+        "one after the other in 0.04 s or more",
     ),
     "a named point that is moved": (
         lambda: evidence(seen=moved_point),
