@@ -23,6 +23,7 @@ from graphslam.slam.path_evidence import NO_PATH, PathMisfits
 from graphslam.slam.robot_state import RobotState
 from graphslam.slam.scan_evidence import Parked, gather_scan_evidence
 from graphslam.slam.sweep_skew import NO_SKEW, SweepSkew, by_robot, sweep_skew
+from graphslam.slam.told_starts import ToldStart, told_starts
 
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 IntTable = np.ndarray[tuple[int, int], np.dtype[np.int64]]
@@ -115,6 +116,7 @@ class Evidence:
 
     ``without_odometry``: robots whose motion is that of their scans. ``observed``: whether an
     observation or a closure is in the estimate. ``closures``: how well these fit; None without.
+    ``told``: the starts that the user gave.
     """
 
     robots: tuple[RobotEvidence, ...]
@@ -123,6 +125,7 @@ class Evidence:
     without_odometry: tuple[str, ...] = ()
     observed: bool = True
     closures: ClosureMisfits | None = None
+    told: tuple[ToldStart, ...] = ()
 
     @property
     def begin_ns(self) -> int:
@@ -177,7 +180,8 @@ def gather(
     observed = any(step.associations or step.closures for step in steps)
     by_scans_alone = tuple(pipeline.log.without_odometry)
     misfits = _closure_misfits(steps, estimate)
-    return Evidence(tuple(found), summary, innovations, by_scans_alone, observed, misfits)
+    told = told_starts(pipeline, steps, estimate)
+    return Evidence(tuple(found), summary, innovations, by_scans_alone, observed, misfits, told)
 
 
 def _closure_misfits(steps: Sequence[Step], estimate: Estimate) -> ClosureMisfits | None:

@@ -19,6 +19,7 @@ from graphslam.slam.moved_points import moved_doubts
 from graphslam.slam.odometry_doubts import odometry_doubts
 from graphslam.slam.scan_doubts import scan_doubts
 from graphslam.slam.sighting_doubts import sighting_doubts
+from graphslam.slam.told_starts import contradictions
 from graphslam.slam.vanished_points import vanished_doubts
 
 #: factors on a stated variance that a log shows: from the first one doubtful, from the other bad
@@ -183,6 +184,22 @@ def _unplaced(evidence: Evidence) -> Iterable[Reason]:
             yield Reason("doubtful", "unplaced", "", text)
 
 
+def _starts(evidence: Evidence) -> Iterable[Reason]:
+    """Starts that were told, but not where the robots saw that they are from each other."""
+    found = contradictions(evidence.told)
+    if not found:
+        return
+    worst = found[0]
+    text = (
+        f"the starts told of {' and '.join(worst.robots)} contradict what the robots saw by "
+        f"{worst.off_m:.2f} m and {math.degrees(worst.off_rad):.1f} degrees: "
+    )
+    one = set(worst.robots).intersection(*(pair.robots for pair in found))
+    is_one = len(found) > 1 and len(one) == 1
+    text += f"that of {one.pop()} is wrong" if is_one else "one of them is wrong"
+    yield Reason("doubtful", "starts", "", f"{text}, and the map lies between the two")
+
+
 def _sessions(evidence: Evidence) -> Iterable[Reason]:
     """Recordings of one place that are not one map, or of which much speaks against it."""
     found = evidence.summary.get("sessions", {})
@@ -221,6 +238,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "rejected": _rejected,
     "lost": _lost,
     "unplaced": _unplaced,
+    "starts": _starts,
     "sessions": _sessions,
     "known map": _known_map,
     "observations": _unobserved,
