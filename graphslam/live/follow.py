@@ -11,7 +11,7 @@ from typing import Any
 
 from graphslam.core.config import Config
 from graphslam.core.config_io import chosen_config
-from graphslam.core.errors import LogError
+from graphslam.core.errors import GraphSlamError, LogError
 from graphslam.core.output_folder import Identity, identity
 from graphslam.core.records import Landmark, Message
 from graphslam.core.suggestions import start_option
@@ -79,7 +79,7 @@ def follow(
         log, file = _opened(growing, chosen, announce)
         session = Session(chosen, log=log)
         folder = _Folder(target, before, session, log)
-        state = "ended"
+        state = "stopped"
         try:
             logs = replace(chosen.logs, reorder_s=chosen.live.reorder_s)
             reader = FileReader(file, replace(chosen, logs=logs))
@@ -88,15 +88,15 @@ def follow(
                 folder.history.add(estimate)
                 each(estimate)
                 folder.write_if_due()
-            if not growing.ended:
-                state = f"has not grown for {chosen.live.wait_s:g} s"
+            state = "ended" if growing.ended else f"has not grown for {chosen.live.wait_s:g} s"
         except KeyboardInterrupt:
             state = "interrupted"
-        except Exception as error:  # what was estimated until then is kept
+        except GraphSlamError as error:
             folder.warnings.append(str(error))
-            if len(folder.history):
-                folder.write("stopped")
             raise
+        finally:
+            if state == "stopped" and len(folder.history):  # what was estimated is kept
+                folder.write(state)
         if not len(folder.history):
             raise LogError(f"{path}: {state}, and nothing could be estimated; see `graphslam info`")
         return folder.write(state, growing.recording())

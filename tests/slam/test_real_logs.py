@@ -154,9 +154,10 @@ def test_five_robots_find_landmarks_without_names(tmp_path, start_sigma_m):
     assert (errors["landmarks"]["missed"], errors["landmarks"]["extra"]) == (0, 0)
 
 
-def test_two_drives_through_a_lab_in_which_much_was_moved_are_one_map(tmp_path):
-    """Nearly all places of the second are recognised at one relative pose, and many of them
-    contradict it. Change detection, which aligns all scans, puts the second drive there too."""
+def test_two_drives_through_a_lab_full_of_legs_of_tables_are_one_map(tmp_path):
+    """Nearly all places of the second are recognised at one relative pose. Most have something in
+    free space of the first, but so have the places that the second drive itself passes again: that
+    is no doubt. Change detection, which aligns all scans, puts the second drive there too."""
     logs = [tmp_path / "monday.mcap", tmp_path / "tuesday.mcap"]
     for number, log in enumerate(logs, 1):
         IMPORTERS["tinyslam"](real_data(f"tinyslam/exp{number}.dat.xz"), log)
@@ -166,6 +167,5 @@ def test_two_drives_through_a_lab_in_which_much_was_moved_are_one_map(tmp_path):
     start = result.summary["starts_found"]["tuesday"]
     off = np.array([start["x"], start["y"], start["phi"]]) - [1.35, -0.32, 0.03]
     assert (np.abs(off) < [0.15, 0.15, 0.03]).all()  # the drives bend by a few decimetres
-    (said,) = [line for line in result.summary["warnings"] if line.startswith("tuesday: ")][-1:]
-    assert "places contradict where it was placed" in said
-    assert result.summary["verdict"]["verdict"] == "doubtful"
+    assert not any("places contradict" in line for line in result.summary["warnings"])
+    assert result.summary["verdict"]["verdict"] == "good"
