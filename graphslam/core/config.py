@@ -280,8 +280,8 @@ class LiveConfig:
     """Estimates while the robots drive (docs/live.md).
 
     horizon_s: how long a past pose is still improved, unless backend.horizon_s says it.
-    max_states: of all robots that are still improved; with more the oldest are not, since the work
-        on a keyframe grows with the cube of their number.
+    max_states: past poses of all robots that are still improved, at most; the oldest leave first.
+        The work on a keyframe grows with the cube of their number.
     reorder_s: how much out of order, by their stamps, messages may come and still be sorted; every
         estimate is that late. wait_s: a recording that has not grown for so long has ended.
     """

@@ -92,8 +92,9 @@ class LivePass(Pipeline):
     ) -> Iterator[LiveEstimate]:
         """Take in messages, sorted by time; gives the estimates of each event.
 
-        ``ready`` are those that come next at once. Scans of a robot that come at once, as after a
-        recorder that fell behind, are reported together, which takes a half of the time.
+        ``ready``: at each time, those that come next without waiting. Where there is odometry among
+        them, scans of a single robot are reported together with what follows: those between two
+        keyframes are then matched at once, which takes little longer than one.
         """
         alone = len(self.runs) == 1 and all(map(self.log.has_scans, self.runs))
         waiting = False
@@ -103,7 +104,7 @@ class LivePass(Pipeline):
             self.record_covariances()
             self._note_closures()
             self._add_places()
-            # odometry becomes an event at once
+            # odometry becomes an event as soon as it is taken in, a scan may wait for odometry
             waiting = alone and any(isinstance(message, ODOMETRY) for message in ready)
             if waiting:
                 continue

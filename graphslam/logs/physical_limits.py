@@ -8,7 +8,7 @@ whole map, or the arithmetic. The limits are far from all that is known to be re
 MAX_RANGE_M = 1000.0
 #: bearing and range to a landmark, also by radio, m
 MAX_SIGHTING_M = 1e5
-#: nearer a landmark has no bearing, m
+#: nearer a landmark has no bearing, m: at 1e-9 an estimate is indeterminate, at 2e-6 it is not
 MIN_SIGHTING_M = 1e-6
 #: sensors on a robot, m from its base
 MAX_MOUNT_M = 1000.0

@@ -21,8 +21,8 @@ from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 #: in the simulated office that were placed right 23 had none, one 0.19; of those in a part that
 #: only looks alike 0.2 to 0.3
 DOUBT_SHARE, LEAST_DOUBTED = 0.2, 2
-#: a place contradicts a map by this factor more than places seen again usually do; of how many of
-#: these at least that is known
+#: a place contradicts a map if it does so by this factor more than the median of places seen again
+#: (tinySLAM's room: 0.05 to 0.2 both); of how many of these that is known at least
 USUAL_FACTOR, LEAST_USUAL = 1.5, 4
 #: share of the best one's support from which another hypothesis is a rival whatever contradicts it;
 #: others are from half of it on, unless they are contradicted
@@ -93,7 +93,13 @@ def contradiction(given: Support) -> str:
     return f"{against} of {len(given.confirmed)} places contradict it, {agreeing} agree with it"
 
 
-def doubt(placed: Support, places: Sequence[SubmapPose], config: LoopClosureConfig) -> str:
+def doubt(
+    placed: Support,
+    places: Sequence[SubmapPose],
+    config: LoopClosureConfig,
+    *,
+    stands_alone: bool = False,
+) -> str:
     """What is to be said of a path that is placed in a map; empty if hardly anything is against it.
 
     Things that were moved contradict the right place too, so it is no reason to refuse it. No doubt
@@ -101,8 +107,9 @@ def doubt(placed: Support, places: Sequence[SubmapPose], config: LoopClosureConf
 
     Args:
         placed: how the places agree.
-        places: by the path itself.
+        places: of the path.
         config: settings of submaps.
+        stands_alone: whether it was believed although many contradict it.
     """
     count = len(placed.contradicted)
     against = _doubted(placed, 0.0)
@@ -112,10 +119,10 @@ def doubt(placed: Support, places: Sequence[SubmapPose], config: LoopClosureConf
             against = _doubted(placed, USUAL_FACTOR * float(np.median(usual)))
     if not against:
         return ""
-    return (
-        f"{against} of {count} places contradict where it was placed: much was moved, or it drove "
-        "elsewhere, where it looks alike"
-    )
+    why = ": much was moved, or it drove elsewhere, where it looks alike"
+    if stands_alone:
+        why = ", but nothing else explains them: much was moved"
+    return f"{against} of {count} places contradict where it was placed{why}"
 
 
 def _doubted(placed: Support, least: float) -> int:

@@ -32,7 +32,7 @@ from graphslam.core.motion_models import (
     unit_error_covs,
 )
 from graphslam.core.records import Motion, Trajectory
-from graphslam.odometry.coarse_sums import coarse_sums
+from graphslam.odometry.coarse_motions import coarse_motions
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
 from graphslam.odometry.integration_windows import in_windows
 from graphslam.odometry.mounted_motions import of_mount
@@ -305,7 +305,7 @@ class Track(Readings):
         if self.is_mounted:
             late = np.rint(1e9 * mean[:, p + 3]).astype(np.int64)
         begin, end = start_ns - late, end_ns - late
-        moved = coarse_sums(self, begin, end, mean[:, :p])
+        moved = coarse_motions(self, begin, end, mean[:, :p])
         delta, cov, d_cal = moved.delta, moved.cov, moved.d_cal
         if self.is_mounted:
             delta, cov, d_cal = of_mount(delta, cov, d_cal, mean[:, p : p + 3], None)

@@ -152,6 +152,7 @@ class RobotState:
         ``laser`` (n, 3): mounts of the sensors whose poses are asked for, if the robot has scans;
         ``start`` and ``away_m``: see `causal`; without ``start`` the world is that of the states.
         """
+        # a live robot asks of its last states alone
         begin = max(bisect_right(self.times, int(times.min(initial=self.state_ns))) - 1, 0)
         poses = np.array(self.causal_poses[begin:]) - np.array([away_m, 0.0, 0.0])
         at, covs = np.array(self.times[begin:], dtype=np.int64), np.array(self.causal_covs[begin:])

@@ -94,15 +94,15 @@ def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"])
     for name, start in given.items():
         known = _group(before, sessions).map
         if known.places:
+            session = sessions[name]
             placed = _lay({name: start}, known, sessions).support
-            own = sessions[name]
             why = contradiction(placed)
             if why:
                 raise EstimationError(
                     f"session {name}: --start contradicts that of {', '.join(before)}: {why}; "
                     "give another start, or none"
                 )
-            if said := doubt(placed, own.own.places, own.log.config.loop_closure):
+            if said := doubt(placed, session.own.places, session.log.config.loop_closure):
                 doubted[name] = said
         before[name] = start
     return doubted
@@ -222,9 +222,8 @@ def _joined(
     if why:
         return why
     remarks = {**one.remarks, **other.remarks}
-    if said := doubt(best.support, best.places, config.loop_closure):
-        if best.support.is_contradicted:
-            said = f"{said.split(':')[0]}, but nothing else explains them: much was moved"
+    against = best.support.is_contradicted
+    if said := doubt(best.support, best.places, config.loop_closure, stands_alone=against):
         remarks |= dict.fromkeys(best.starts, said)
     return _Group(
         {**one.starts, **best.starts},

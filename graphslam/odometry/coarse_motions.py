@@ -1,4 +1,4 @@
-"""Sums along the path of a track in pieces that each count as one increment: short arcs.
+"""Motions of a track in pieces that each count as one increment: short arcs.
 
 For many motions from few starts, each with a calibration of its own.
 """
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 COARSE_M = 0.3
 
 
-def coarse_sums(track: "Track", begin: IntArray, end: IntArray, calibration: Array) -> Motions:
+def coarse_motions(track: "Track", begin: IntArray, end: IntArray, calibration: Array) -> Motions:
     """The base's motions of a track between times (n,) of the odometry's clock.
 
     By parameters (n, p). Knots lie `COARSE_M` of effort apart, counted from each start; motions
