@@ -31,7 +31,7 @@ MAX_BURST_SHARE = 0.01
 EDGE_NS = 500_000_000
 #: readings that wait for integration at most: each is an array until then
 MOST_PENDING = 50_000
-#: readings of one robot that are integrated one by one at most: arrays take as long as eight of them
+#: readings of one robot that are integrated one by one at most: arrays take as long as eight do
 FEW = 4
 #: m per rad: how much path a turn counts for when a correction is spread over an interval
 TURNING_EFFORT_M = 0.3
