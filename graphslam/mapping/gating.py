@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from graphslam.core.config import AssociationConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
-from graphslam.core.geometry import Array, between, compose, wrap
+from graphslam.core.geometry import Array, between, compose, rotate_cov, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Observation
@@ -91,11 +91,15 @@ def gate_distance(probability: float, dof: IntArray | int) -> Array:
 
 
 def gate_floor(config: AssociationConfig) -> dict[str, Array]:
-    """Model -> covariance (rows, rows) added to innovations before they are gated."""
+    """Model -> covariance (k, k) added to that of a measurement, along its own axes, for gates.
+
+    A wall is not flat where it is seen: a line is off there, and not at the origin of its landmark,
+    which may be metres away along it. There the error of its direction adds to the other one.
+    """
     m2, rad2 = config.floor_m**2, config.floor_rad**2
     polar, pose = np.diag([rad2, m2]), np.diag([m2, m2, rad2])
     return {
-        "line": np.diag([m2, rad2]),
+        "line": np.diag([0.0, m2, rad2]),
         "point": polar,
         "segment": pose,
         "robot-point": polar,
@@ -213,9 +217,9 @@ def compare(
         P_xx: covariance (k, 3, 3) of the pose; all three along world axes.
         P_xt: (k, 3, 3) cross covariance with the landmark, points padded with zeros.
         P_tt: (k, 3, 3) of the landmark, likewise.
-        floor: model name -> covariance (rows, rows) added to every innovation for what the models
-            leave out (walls that are not flat, inexact stamps). It widens the gates and never
-            enters the estimate.
+        floor: model name -> covariance (k, k) added to that of every measurement for what the
+            models leave out (walls that are not flat, inexact stamps), see `gate_floor`. It widens
+            the gates and never enters the estimate.
     """
     k = len(pairs.observation)
     d2, dof = np.full(k, np.inf), np.zeros(k, dtype=np.int64)
@@ -234,7 +238,8 @@ def compare(
         t = states[which][:, : model.dim]
         x = np.broadcast_to(pose, (len(which), 3))
         r = model.residual(z, x, t)
-        R = model.noise(z, cov, x, t) + floor[name]
+        more = floor[name] if z.shape[1] == 2 else rotate_cov(floor[name], z[:, 2])
+        R = model.noise(z, cov + more, x, t)
         H_x, H_t = model.jacobians(z, x, t)
         tt, xt = P_tt[which][:, : model.dim, : model.dim], P_xt[which][:, :, : model.dim]
         cross = H_x @ xt @ H_t.mT

@@ -420,6 +420,15 @@ def test_a_wall_seen_in_two_parts_is_one_landmark():
     assert targets(found) == [0, 0, 0] and len(run.map) == 1
 
 
+def test_a_door_behind_its_wall_is_not_taken_for_a_part_of_it():
+    """Alone it would be: the pose is off by 5 cm. Beside its wall it is known to lie elsewhere."""
+    run = Run(AssociationConfig(), pose_cov=np.diag([0.05, 0.05, 0.01]) ** 2)
+    run.learn(wall(0.0, 2.0, 0.0))
+    door = wall(1.0, 2.1, 0.0, half=0.4)
+    assert targets(run.look(wall(-0.5, 2.0, 0.0, half=1.0), door)) == [0]
+    assert targets(run.look(door)) == [0]
+
+
 def test_a_wall_grows_with_what_is_seen_of_it():
     run = Run()
     run.learn(wall(0, 4, 0, half=1))

@@ -17,8 +17,8 @@ from graphslam.mapping import gating
 UNDIRECTED = AssociationConfig(directed=False)
 DIRECTED = AssociationConfig(directed=True)
 POSE = np.array([2.0, -1.0, 0.6])
-#: nothing added to the innovations
-NO_FLOOR = {name: np.zeros((model.rows, model.rows)) for name, model in MODELS.items()}
+#: nothing added to the measurements
+NO_FLOOR = {name: np.zeros_like(floor) for name, floor in gating.gate_floor(DIRECTED).items()}
 POINT_COV = np.diag([1e-4, 1e-4])
 LINE_COV = np.diag([1.0, 1e-4, 1e-4])
 
@@ -229,6 +229,18 @@ def test_gate_accepts_its_probability_of_true_pairs(name, probability):
     assert set(result.dof) == {model.rows}
     share = np.mean(result.d2 < gating.gate_distance(probability, result.dof))
     assert abs(share - probability) < 4 * np.sqrt(probability * (1 - probability) / n)
+
+
+@pytest.mark.parametrize("away", [0.0, 6.0, -15.0])
+@pytest.mark.parametrize("turn", [0.0, 1.2, -2.5])
+def test_the_floor_of_a_wall_is_where_it_is_seen(away, turn):
+    """A door 0.1 m behind its wall is as far off wherever the landmark has its origin. Added at the
+    origin, the floor of the direction hides it from some metres on: at 15 m d² would be 0.5."""
+    config = AssociationConfig(floor_m=0.03, floor_rad=0.03)
+    line = compose(np.array([4.0, 0.0, turn]), np.array([away, 0.1, 0.0]))
+    seen = [see_line([4.0, 0.0, turn], (-0.4, 0.4), cov=np.diag([0.04, 1e-4, 1e-4]))]
+    d2 = compared(seen, ["line"], [line], floor=gating.gate_floor(config)).d2
+    assert d2[0] == pytest.approx(0.1**2 / (0.03**2 + 1e-4), rel=1e-6)
 
 
 def test_gate_is_the_chi_square_quantile():
