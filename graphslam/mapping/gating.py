@@ -91,11 +91,7 @@ def gate_distance(probability: float, dof: IntArray | int) -> Array:
 
 
 def gate_floor(config: AssociationConfig) -> dict[str, Array]:
-    """Model -> covariance (k, k) added to that of a measurement, along its own axes, for gates.
-
-    A wall is not flat where it is seen: a line is off there, and not at the origin of its landmark,
-    which may be metres away along it. There the error of its direction adds to the other one.
-    """
+    """Model -> covariance (k, k) added to that of a measurement for gates, see `floor_covs`."""
     m2, rad2 = config.floor_m**2, config.floor_rad**2
     polar, pose = np.diag([rad2, m2]), np.diag([m2, m2, rad2])
     return {
@@ -105,6 +101,23 @@ def gate_floor(config: AssociationConfig) -> dict[str, Array]:
         "robot-point": polar,
         "robot-pose": pose,
     }
+
+
+def floor_covs(floor: Array, z: Array) -> Array:
+    """Covariances (n, k, k) added to those of measurements ``z`` (n, k), in the robot's frame.
+
+    ``floor`` (k, k) is along each one's own axes. Directions are off since the robot's is, so walls
+    turn about the robot, and what is off across them is so where they pass it. At the origin of a
+    landmark, which may be metres away along the wall, a door a decimetre behind it would hide in
+    the error of its direction. Where the wall is seen, one that is seen metres ahead would be
+    refused where the odometry turned too far.
+    """
+    if z.shape[1] == 2:
+        return floor
+    c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
+    J = np.tile(np.eye(3), (len(z), 1, 1))
+    J[:, 1, 2] = c * z[:, 0] + s * z[:, 1]  # along the wall, from where it passes the robot
+    return rotate_cov(J @ floor @ J.mT, z[:, 2])
 
 
 @functools.cache
@@ -238,8 +251,7 @@ def compare(
         t = states[which][:, : model.dim]
         x = np.broadcast_to(pose, (len(which), 3))
         r = model.residual(z, x, t)
-        more = floor[name] if z.shape[1] == 2 else rotate_cov(floor[name], z[:, 2])
-        R = model.noise(z, cov + more, x, t)
+        R = model.noise(z, cov + floor_covs(floor[name], z), x, t)
         H_x, H_t = model.jacobians(z, x, t)
         tt, xt = P_tt[which][:, : model.dim, : model.dim], P_xt[which][:, :, : model.dim]
         cross = H_x @ xt @ H_t.mT

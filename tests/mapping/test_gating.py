@@ -233,14 +233,28 @@ def test_gate_accepts_its_probability_of_true_pairs(name, probability):
 
 @pytest.mark.parametrize("away", [0.0, 6.0, -15.0])
 @pytest.mark.parametrize("turn", [0.0, 1.2, -2.5])
-def test_the_floor_of_a_wall_is_where_it_is_seen(away, turn):
+def test_the_floor_of_a_wall_is_where_it_passes_the_robot(away, turn):
     """A door 0.1 m behind its wall is as far off wherever the landmark has its origin. Added at the
     origin, the floor of the direction hides it from some metres on: at 15 m d² would be 0.5."""
     config = AssociationConfig(floor_m=0.03, floor_rad=0.03)
-    line = compose(np.array([4.0, 0.0, turn]), np.array([away, 0.1, 0.0]))
-    seen = [see_line([4.0, 0.0, turn], (-0.4, 0.4), cov=np.diag([0.04, 1e-4, 1e-4]))]
+    wall = compose(POSE, compose(np.array([0.0, 0.0, turn]), np.array([0.0, 2.0, 0.0])))
+    line = compose(wall, np.array([away, 0.1, 0.0]))
+    seen = [see_line(wall, (-0.4, 0.4), cov=np.diag([0.04, 1e-4, 1e-4]))]
     d2 = compared(seen, ["line"], [line], floor=gating.gate_floor(config)).d2
     assert d2[0] == pytest.approx(0.1**2 / (0.03**2 + 1e-4), rel=1e-6)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 3.0, 8.0])
+def test_a_wall_that_is_seen_turned_about_the_robot_is_as_far_off_at_any_distance(ahead):
+    """Odometry that turned by 0.06 rad too much: 8 m ahead that is 0.5 m across. Added where the
+    wall is seen, the floor of the direction refuses it: d² would be 260."""
+    config = AssociationConfig(floor_m=0.03, floor_rad=0.03)
+    wall = compose(POSE, np.array([ahead, 1.0, 0.0]))
+    turned = compose(POSE, compose(np.array([0.0, 0.0, 0.06]), np.array([ahead, 1.0, 0.0])))
+    seen = [see_line(turned, (-0.4, 0.4), cov=np.diag([0.04, 1e-10, 1e-10]))]
+    d2 = compared(seen, ["line"], [wall], floor=gating.gate_floor(config)).d2
+    # the second order of the turn: 1 m to the side moves by 2 mm
+    assert d2[0] == pytest.approx((0.06 / 0.03) ** 2, abs=0.1)
 
 
 def test_gate_is_the_chi_square_quantile():
