@@ -73,7 +73,8 @@ class Pairs:
 class PairDistances:
     """Squared Mahalanobis distances (k,) of pairs, with what a joint test needs.
 
-    ``residuals``, their covariances ``cov``, ``H_x`` and ``H_t`` hold one array per pair.
+    ``residuals``, their covariances ``cov``, ``H_x`` and ``H_t`` hold one array per pair;
+    ``estimated_cov`` is ``cov`` without the floor of the gates.
     """
 
     d2: Array
@@ -83,6 +84,7 @@ class PairDistances:
     H_x: tuple[Array, ...]
     H_t: tuple[Array, ...]
     noise: tuple[Array, ...]
+    estimated_cov: tuple[Array, ...]
 
 
 def gate_distance(probability: float, dof: IntArray | int) -> Array:
@@ -241,6 +243,7 @@ def compare(
     H_ts: list[Array] = [np.zeros((0, 3))] * k
     noises: list[Array] = [np.zeros((0, 0))] * k
     covs: list[Array] = [np.zeros((0, 0))] * k
+    estimated: list[Array] = [np.zeros((0, 0))] * k
     both = zip(pairs.observation, pairs.flipped, strict=True)
     oriented = [flip(seen[i]) if flipped else seen[i] for i, flipped in both]
     for name in sorted(set(pairs.model)):
@@ -255,15 +258,18 @@ def compare(
         H_x, H_t = model.jacobians(z, x, t)
         tt, xt = P_tt[which][:, : model.dim, : model.dim], P_xt[which][:, :, : model.dim]
         cross = H_x @ xt @ H_t.mT
-        S = H_x @ P_xx[which] @ H_x.mT + cross + cross.mT + H_t @ tt @ H_t.mT + R
+        P = H_x @ P_xx[which] @ H_x.mT + cross + cross.mT + H_t @ tt @ H_t.mT
+        S, known = P + R, P + model.noise(z, cov, x, t)
         d2[which] = mahalanobis_squared(r, S)
         dof[which] = model.rows
         for place, n in enumerate(which):
             residuals[n], covs[n], noises[n] = r[place], S[place], R[place]
+            estimated[n] = known[place]
             H_xs[n], H_ts[n] = H_x[place], H_t[place]
     return PairDistances(
-        d2, dof, tuple(residuals), tuple(covs), tuple(H_xs), tuple(H_ts), tuple(noises)
-    )
+        d2, dof, tuple(residuals), tuple(covs), tuple(H_xs), tuple(H_ts), tuple(noises),
+        tuple(estimated),
+    )  # fmt: skip
 
 
 def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:

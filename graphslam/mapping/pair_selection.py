@@ -88,5 +88,6 @@ def known_alone(pairs: Pairs, compared: PairDistances) -> BoolArray:
     known = np.zeros(len(pairs.model), dtype=bool)
     for k, model in enumerate(pairs.model):
         if model in limits:
-            known[k] = bool((np.diagonal(compared.cov[k]) < np.square(limits[model])).all())
+            variance = np.diagonal(compared.estimated_cov[k])
+            known[k] = bool((variance < np.square(limits[model])).all())
     return known
