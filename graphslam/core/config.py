@@ -54,20 +54,21 @@ class AssociationConfig:
     distance across the line, with overlap along it, segments of other lengths being compared as
     lines; `middle` = that of the middles, as printed, and nothing else. directed: a line has two
     sides; false compares directions modulo pi (3.24). gate_probability: of the chi-square gate
-    (3.25). floor_m, floor_rad: added to the innovations' sigmas before gating, for model errors;
-    they never enter the estimate. new_landmark_probability: an observation is a new landmark only
-    if its distance to every landmark exceeds this second, higher quantile. overlap_gap_m: largest
-    gap along the line between an observed segment and the landmark's extent. overlap_ratio: share
-    of the shorter of the two that must overlap while one robot's scans are tracked, where the
-    landmarks are those of the last metres (back end batch). sightings_to_promote:
-    a tentative landmark enters the graph at this many sightings. tentative_s, tentative_m: one not
-    observed again within this time and path is deleted. delete_s: one in the graph that is not
-    observed for this long is not associated again, and a filter deletes it (section 4.6).
-    reacquire_m: a landmark not observed for this much path counts as old; old lines are matched
-    again only if reacquire_min of them, not all parallel, agree, or if the estimate knows to 0.1 m
-    and 0.05 rad (sigma) where the robot should see it. reassociation_gate_m (across),
-    reassociation_gate_rad: largest residual of an observation when the solved log is associated
-    again, and distance of one landmark's visits.
+    (3.25). floor_m, floor_rad: added to the innovations' sigmas before gating, for model errors, to
+    those of a wall where it passes the robot (while one robot's scans are tracked, at the origin of
+    its landmark); they never enter the estimate. new_landmark_probability: an observation is a new
+    landmark only if its distance to every landmark exceeds this second, higher quantile.
+    overlap_gap_m: largest gap along the line between an observed segment and the landmark's extent.
+    overlap_ratio: share of the shorter of the two that must overlap while one robot's scans are
+    tracked, where the landmarks are those of the last metres (back end batch).
+    sightings_to_promote: a tentative landmark enters the graph at this many sightings. tentative_s,
+    tentative_m: one not observed again within this time and path is deleted. delete_s: one in the
+    graph that is not observed for this long is not associated again, and a filter deletes it
+    (section 4.6). reacquire_m: a landmark not observed for this much path counts as old; old lines
+    are matched again only if reacquire_min of them, not all parallel, agree, or if the estimate
+    knows to 0.1 m and 0.05 rad (sigma) where the robot should see it. reassociation_gate_m
+    (across), reassociation_gate_rad: largest residual of an observation when the solved log is
+    associated again, and distance of one landmark's visits.
     """
 
     method: Literal["optimal", "greedy"] = "optimal"

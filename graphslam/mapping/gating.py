@@ -30,6 +30,8 @@ TYPICAL_M, TYPICAL_RAD = 0.1, 0.05
 LENGTH_TOLERANCE_M = 0.15
 #: m: sigma of a position that counts as determined; walls that differ by 5° just miss it
 MAX_POSITION_SIGMA_M = 0.2
+#: models of walls
+WALLS = ("line", "segment")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +76,7 @@ class PairDistances:
     """Squared Mahalanobis distances (k,) of pairs, with what a joint test needs.
 
     ``residuals``, their covariances ``cov``, ``H_x`` and ``H_t`` hold one array per pair;
-    ``estimated_cov`` is ``cov`` without the floor of the gates.
+    ``cov_without_floor`` is ``cov`` without the floor of the gates.
     """
 
     d2: Array
@@ -84,7 +86,7 @@ class PairDistances:
     H_x: tuple[Array, ...]
     H_t: tuple[Array, ...]
     noise: tuple[Array, ...]
-    estimated_cov: tuple[Array, ...]
+    cov_without_floor: tuple[Array, ...]
 
 
 def gate_distance(probability: float, dof: IntArray | int) -> Array:
@@ -93,7 +95,7 @@ def gate_distance(probability: float, dof: IntArray | int) -> Array:
 
 
 def gate_floor(config: AssociationConfig) -> dict[str, Array]:
-    """Model -> covariance (k, k) added to that of a measurement for gates, see `floor_covs`."""
+    """Model -> covariance (k, k) added to that of a measurement for gates; walls: `wall_floors`."""
     m2, rad2 = config.floor_m**2, config.floor_rad**2
     polar, pose = np.diag([rad2, m2]), np.diag([m2, m2, rad2])
     return {
@@ -105,17 +107,14 @@ def gate_floor(config: AssociationConfig) -> dict[str, Array]:
     }
 
 
-def floor_covs(floor: Array, z: Array) -> Array:
-    """Covariances (n, k, k) added to those of measurements ``z`` (n, k), in the robot's frame.
+def wall_floors(floor: Array, z: Array) -> Array:
+    """Covariances (n, 3, 3) added to those of walls ``z`` (n, 3), seen from the robot, for gates.
 
-    ``floor`` (k, k) is along each one's own axes. Directions are off since the robot's is, so walls
-    turn about the robot, and what is off across them is so where they pass it. At the origin of a
-    landmark, which may be metres away along the wall, a door a decimetre behind it would hide in
-    the error of its direction. Where the wall is seen, one that is seen metres ahead would be
-    refused where the odometry turned too far.
+    ``floor`` (3, 3) is along each one's own axes, where it passes the robot: directions are off as
+    the robot's is, so walls turn about it. At the origin of a landmark, which may be metres away
+    along the wall, a door a decimetre behind it would hide in the error of its direction. Where the
+    wall is seen, one that is seen metres ahead would be refused where the odometry turned too far.
     """
-    if z.shape[1] == 2:
-        return floor
     c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
     J = np.tile(np.eye(3), (len(z), 1, 1))
     J[:, 1, 2] = c * z[:, 0] + s * z[:, 1]  # along the wall, from where it passes the robot
@@ -243,7 +242,7 @@ def compare(
     H_ts: list[Array] = [np.zeros((0, 3))] * k
     noises: list[Array] = [np.zeros((0, 0))] * k
     covs: list[Array] = [np.zeros((0, 0))] * k
-    estimated: list[Array] = [np.zeros((0, 0))] * k
+    covs_without: list[Array] = [np.zeros((0, 0))] * k
     both = zip(pairs.observation, pairs.flipped, strict=True)
     oriented = [flip(seen[i]) if flipped else seen[i] for i, flipped in both]
     for name in sorted(set(pairs.model)):
@@ -254,21 +253,22 @@ def compare(
         t = states[which][:, : model.dim]
         x = np.broadcast_to(pose, (len(which), 3))
         r = model.residual(z, x, t)
-        R = model.noise(z, cov + floor_covs(floor[name], z), x, t)
+        more = wall_floors(floor[name], z) if name in WALLS else floor[name]
+        R, without = model.noise(z, cov + more, x, t), model.noise(z, cov, x, t)
         H_x, H_t = model.jacobians(z, x, t)
         tt, xt = P_tt[which][:, : model.dim, : model.dim], P_xt[which][:, :, : model.dim]
         cross = H_x @ xt @ H_t.mT
         P = H_x @ P_xx[which] @ H_x.mT + cross + cross.mT + H_t @ tt @ H_t.mT
-        S, known = P + R, P + model.noise(z, cov, x, t)
+        S, own = P + R, P + without
         d2[which] = mahalanobis_squared(r, S)
         dof[which] = model.rows
         for place, n in enumerate(which):
             residuals[n], covs[n], noises[n] = r[place], S[place], R[place]
-            estimated[n] = known[place]
+            covs_without[n] = own[place]
             H_xs[n], H_ts[n] = H_x[place], H_t[place]
     return PairDistances(
         d2, dof, tuple(residuals), tuple(covs), tuple(H_xs), tuple(H_ts), tuple(noises),
-        tuple(estimated),
+        tuple(covs_without),
     )  # fmt: skip
 
 

@@ -88,6 +88,6 @@ def known_alone(pairs: Pairs, compared: PairDistances) -> BoolArray:
     known = np.zeros(len(pairs.model), dtype=bool)
     for k, model in enumerate(pairs.model):
         if model in limits:
-            variance = np.diagonal(compared.estimated_cov[k])
+            variance = np.diagonal(compared.cov_without_floor[k])
             known[k] = bool((variance < np.square(limits[model])).all())
     return known

@@ -257,6 +257,18 @@ def test_a_wall_that_is_seen_turned_about_the_robot_is_as_far_off_at_any_distanc
     assert d2[0] == pytest.approx((0.06 / 0.03) ** 2, abs=0.1)
 
 
+@pytest.mark.parametrize("heading", [0.0, 1.5])
+def test_the_floor_of_a_sighted_robot_is_the_same_whichever_way_it_heads(heading):
+    """A robot 8 m ahead that is 0.24 m aside and 0.03 rad turned: eight floors and one. The floor
+    of a wall would turn it about us if it drove away from us (d² 1), and less if across."""
+    config = AssociationConfig(floor_m=0.03, floor_rad=0.03)
+    seen = [Observation("robot-pose", np.array([8.0, 0.0, heading]), 1e-10 * np.eye(3))]
+    there = compose(POSE, np.array([8.0, 0.24, heading + 0.03]))
+    d2 = compared(seen, ["robot-pose"], [there], floor=gating.gate_floor(config)).d2
+    # residuals are logarithms: of 0.03 rad a second order of 4e-5 of the whole
+    assert d2[0] == pytest.approx(8.0**2 + 1.0, rel=1e-3)
+
+
 def test_gate_is_the_chi_square_quantile():
     assert gating.gate_distance(0.99, 2) == pytest.approx(9.2103, abs=1e-4)
     np.testing.assert_allclose(
