@@ -5,7 +5,9 @@ knows, a place that is passed again would be mapped a second time. So scans are 
 state every few metres is kept with the scans around it, as a *place*, and each new one is searched
 for in those that may be the same (`mapping.loop_closure`), in a second process where the program
 allows that. What two searches agree on becomes a closure between two kept states. The estimate then
-moves at once, and says so.
+moves at once, and says so. It has to come so near only that landmarks are recognised, which tell
+more, and the same scans tell both: so a closure enters with much less than its match has
+(`ENTERED`).
 
 Places stay, one where several are near each other; of each of the others three dormant variables
 may be left.
@@ -46,6 +48,14 @@ APART_NS = 100_000_000
 #: places that must agree, at least: if the estimate may be as far off as they say, and if its
 #: covariance denies that; m: the last ones are so far back
 AGREEING, AGAINST, RECENT_M = 2, 3, 40.0
+#: factor on the covariance with which a closure enters, 9 cm and 0.02 rad mostly. Scans around a
+#: place are laid by the path as it was estimated there: drift within its 6 m bends both sides of a
+#: match (chi-square up to 66 and 190 where odometry turns by 0.02 and 0.03 rad a metre too much).
+#: And the places that agree see the same walls, which their landmarks count once more. Live
+#: relations of Intel without its first 20 and 300 s by 1 and 16: 0.088, 0.077 and 0.077, 0.054 m,
+#: without any closure 0.077 and 0.053; loops of ACES with two draws of noise on its odometry 0.74,
+#: 0.75 and 0.84, 0.71 m, without closures 2.9 and 3.1
+ENTERED = 16.0
 #: m, m, rad: sigmas of a drift that the covariance does not know of, common to the last places
 UNKNOWN_DRIFT = np.array([3.0, 3.0, 0.2])
 #: m, rad: a closure that moves the estimate by less only confirms it
@@ -245,7 +255,12 @@ class LoopCloser:
         moves = (np.hypot(off[:, 0], off[:, 1]) > CONFIRMED[0]) | (np.abs(off[:, 2]) > CONFIRMED[1])
         used = {id(c) for c in agreed}
         self._found = [c for c in self._found if id(c) not in used]
-        return tuple(agreed) if moves.any() else ()
+        return tuple(_less_certain(c) for c in agreed) if moves.any() else ()
+
+
+def _less_certain(closure: Closure) -> Closure:
+    """A closure as it enters the estimate, see `ENTERED`."""
+    return replace(closure, cov=ENTERED * closure.cov)
 
 
 def _count_places(closures: Sequence[Closure]) -> int:
