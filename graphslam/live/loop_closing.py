@@ -5,8 +5,8 @@ knows, a place that is passed again would be mapped a second time. So scans are 
 state every few metres is kept with the scans around it, as a *place*, and each new one is searched
 for in those that may be the same (`mapping.loop_closure`), in a second process where the program
 allows that. What two searches agree on becomes a closure between two kept states. The estimate then
-moves at once, and says so. It has to come so near only that landmarks are recognised, which tell
-more, and the same scans tell both: so a closure enters with much less than its match has
+moves at once, and says so. It only has to come near enough for landmarks to be recognised, which
+tell more and come from the same scans: so a closure enters far less certain than its match
 (`ENTERED`).
 
 Places stay, one where several are near each other; of each of the others three dormant variables
