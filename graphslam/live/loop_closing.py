@@ -7,7 +7,7 @@ for in those that may be the same (`mapping.loop_closure`), in a second process 
 allows that. What two searches agree on becomes a closure between two kept states. The estimate then
 moves at once, and says so. It only has to come near enough for landmarks to be recognised, which
 tell more and come from the same scans: so a closure enters far less certain than its match
-(`ENTERED`).
+(`CLOSURE_INFLATION`).
 
 Places stay, one where several are near each other; of each of the others three dormant variables
 may be left.
@@ -48,14 +48,14 @@ APART_NS = 100_000_000
 #: places that must agree, at least: if the estimate may be as far off as they say, and if its
 #: covariance denies that; m: the last ones are so far back
 AGREEING, AGAINST, RECENT_M = 2, 3, 40.0
-#: factor on the covariance with which a closure enters, 9 cm and 0.02 rad mostly. Scans around a
-#: place are laid by the path as it was estimated there: drift within its 6 m bends both sides of a
-#: match (chi-square up to 66 and 190 where odometry turns by 0.02 and 0.03 rad a metre too much).
-#: And the places that agree see the same walls, which their landmarks count once more. Live
-#: relations of Intel without its first 20 and 300 s by 1 and 16: 0.088, 0.077 and 0.077, 0.054 m,
-#: without any closure 0.077 and 0.053; loops of ACES with two draws of noise on its odometry 0.74,
-#: 0.75 and 0.84, 0.71 m, without closures 1.9 and 1.3
-ENTERED = 16.0
+#: factor on the covariance of a match where it enters as a closure; sigmas are 9 cm and 0.02 rad
+#: mostly then. Scans around a place are laid by the path as it was estimated there: drift within
+#: its 6 m bends both sides of a match (chi-square up to 66 and 190 where odometry turns by 0.02 and
+#: 0.03 rad a metre too much). And the places that agree see the same walls, which their landmarks
+#: count once more. Mean errors of live relations of Intel without its first 20 and 300 s by 1 and
+#: 16: 0.088, 0.077 and 0.077, 0.054 m, without any closure 0.077 and 0.053; loops of ACES with two
+#: draws of noise on its odometry 0.74, 0.75 and 0.84, 0.71 m, without closures 1.9 and 1.3
+CLOSURE_INFLATION = 16.0
 #: m, m, rad: sigmas of a drift that the covariance does not know of, common to the last places
 UNKNOWN_DRIFT = np.array([3.0, 3.0, 0.2])
 #: m, rad: a closure that moves the estimate by less only confirms it
@@ -255,12 +255,9 @@ class LoopCloser:
         moves = (np.hypot(off[:, 0], off[:, 1]) > CONFIRMED[0]) | (np.abs(off[:, 2]) > CONFIRMED[1])
         used = {id(c) for c in agreed}
         self._found = [c for c in self._found if id(c) not in used]
-        return tuple(_less_certain(c) for c in agreed) if moves.any() else ()
-
-
-def _less_certain(closure: Closure) -> Closure:
-    """A closure as it enters the estimate, see `ENTERED`."""
-    return replace(closure, cov=ENTERED * closure.cov)
+        if not moves.any():
+            return ()
+        return tuple(replace(c, cov=CLOSURE_INFLATION * c.cov) for c in agreed)
 
 
 def _count_places(closures: Sequence[Closure]) -> int:
