@@ -15,13 +15,15 @@ from graphslam.core.config import Config, RobotConfig
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between
 from graphslam.logs import schemas, time_order
+from graphslam.logs.clock_steps import Spans, spans_of_stamps
 from graphslam.logs.decoders import TopicContext
+from graphslam.logs.file_reader import FileReader
 from graphslam.logs.findings import Finding
 from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.gyroscopes import find_gyroscopes
 from graphslam.logs.lasers import FurtherLasers, further_lasers
 from graphslam.logs.log_checks import CheckedLog, by_severity, check_log
-from graphslam.logs.log_set import FileReader, LogFile, damage, merged_notes
+from graphslam.logs.log_set import LogFile, damage, merged_notes
 from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.separate_times import check_separate_times
@@ -108,8 +110,9 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         except LogError as error:
             problem = str(error)
     dropped: Counter[str] = Counter()
+    spans = {file.path: spans_of_stamps(file, topics, contexts) for file in files}
     readings = {
-        topic.name: _read_topic(files, topic, contexts, config, dropped)
+        topic.name: _read_topic(files, topic, contexts, config, spans, dropped)
         for topic in topics
         if topic.count
     }
@@ -196,11 +199,12 @@ def _read_topic(
     topic: Topic,
     contexts: Mapping[str, TopicContext],
     config: Config,
+    spans: Mapping[Path, Spans],
     dropped: Counter[str],
 ) -> _Reading:
     reading = _Reading()
     for file in files:
-        reader = FileReader(file, config)
+        reader = FileReader(file, config, spans[file.path])
         recorded = reader.recorded({topic.name: topic}, contexts)
         for message in reader.sorted(reading.add_recorded(recorded)):
             reading.add_sorted(message)

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 
 from graphslam.core import records
@@ -14,13 +13,14 @@ from graphslam.core.records import Message
 from graphslam.core.worker import Prefetch
 from graphslam.logs import time_order
 from graphslam.logs.clock_check import check_clocks
+from graphslam.logs.clock_steps import OTHER_CLOCK, Spans, spans_of_stamps
 from graphslam.logs.decoders import TopicContext, decode_messages
+from graphslam.logs.file_reader import NO_SPANS, FileReader, stamp_warnings
 from graphslam.logs.findings import Finding
-from graphslam.logs.future_stamps import Recorded, repair_future_stamps
 from graphslam.logs.gyroscopes import find_gyroscopes
 from graphslam.logs.imu_turning import Turning, with_turning
 from graphslam.logs.lasers import further_lasers
-from graphslam.logs.recording import RawMessage, Recording, raw_messages, sample_messages
+from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.robots import robots_and_topics
 from graphslam.logs.separate_times import check_separate_times
 from graphslam.logs.sessions import open_recordings
@@ -80,6 +80,7 @@ class LogSet:
     gyroscopes: Mapping[str, Turning] = field(repr=False, default_factory=dict)
     further_lasers: tuple[Topic, ...] = ()
     wrapped: frozenset[str] = frozenset()
+    _spans: Mapping[Path, Spans] = field(repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self._opening_warnings = len(self.warnings)
@@ -262,7 +263,8 @@ class LogSet:
         self, topics: Mapping[str, Topic], contexts: Mapping[str, TopicContext]
     ) -> Iterator["Message | ReadReport"]:
         """Messages of ``topics`` and, last, the report about all of them."""
-        readers = [FileReader(file, self.config) for file in self.opened]
+        spans = self._spans
+        readers = [FileReader(f, self.config, spans.get(f.path, NO_SPANS)) for f in self.opened]
         streams = [reader.sorted(reader.recorded(topics, contexts)) for reader in readers]
         report, merged = ReadReport(), time_order.merge(streams)
         if self.wrapped:
@@ -270,8 +272,13 @@ class LogSet:
         yield from with_turning(merged, self.gyroscopes) if self.gyroscopes else merged
         for reader in readers:
             report.dropped.update(reader.dropped)
+            if reader.dropped[OTHER_CLOCK]:
+                report.warnings.append(
+                    f"{reader.file.path}: {reader.dropped[OTHER_CLOCK]} messages are {OTHER_CLOCK} "
+                    "meanwhile; they are left out. To use them, cut the recording there"
+                )
             for topic, counts in sorted(reader.sorter.counts.items()):
-                report.warnings.extend(_stamp_warnings(reader, topic, counts))
+                report.warnings.extend(stamp_warnings(reader, topic, counts))
                 for kind in time_order.DROPPED:
                     report.dropped[kind] += counts.pop(kind, 0)
                 report.repaired.update(counts)
@@ -345,6 +352,7 @@ def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
         gyroscopes=gyroscopes,
         further_lasers=tuple(lasers.topics),
         wrapped=wrapped,
+        _spans={f.path: spans_of_stamps(f, (*topics, *lasers.topics), contexts) for f in files},
     )
 
 
@@ -369,82 +377,4 @@ def damage(files: Iterable[Recording]) -> list[Finding]:
         )
         for f in files
         if f.damage or f.lost
-    ]
-
-
-#: messages that are decoded together: enough for arrays to pay, few enough to hold in memory; fewer
-#: where there are scans, which are large
-_BATCH, _BATCH_WITH_SCANS = 1024, 128
-
-
-class FileReader:
-    """One pass over the messages of one file.
-
-    ``dropped`` and the counts of ``sorter`` are those of the messages read so far.
-    """
-
-    def __init__(self, file: Recording, config: Config) -> None:
-        """Prepare to read ``file`` with the window of ``config.logs``."""
-        self.file = file
-        self.sorter = time_order.MessageSorter(round(config.logs.reorder_s * 1e9))
-        self.dropped: Counter[str] = Counter()
-
-    def recorded(
-        self, topics: Mapping[str, Topic], contexts: Mapping[str, TopicContext]
-    ) -> Iterator[Recorded]:
-        """Messages of ``topics`` in the order of recording, with their topic and log time."""
-        # decoders count dropped beams in the counter of this pass
-        own = {name: replace(context, beams=self.dropped) for name, context in contexts.items()}
-        raws = raw_messages(self.file, topics.keys())
-        scans = any(topic.record is records.Scan for topic in topics.values())
-        while batch := list(islice(raws, _BATCH_WITH_SCANS if scans else _BATCH)):
-            yield from decoded(batch, topics, own, self.dropped)
-
-    def sorted(self, recorded: Iterable[Recorded]) -> Iterator[Message]:
-        """The messages in the order of their repaired times."""
-        for topic, message, _ in repair_future_stamps(recorded, time_order.SAMPLED):
-            yield from self.sorter.push(topic, message)
-        yield from self.sorter.finish()
-
-
-def decoded(
-    batch: Sequence[RawMessage],
-    topics: Mapping[str, Topic],
-    contexts: Mapping[str, TopicContext],
-    dropped: Counter[str],
-) -> Iterator[Recorded]:
-    """Messages of ``topics``, those of each decoded together; what cannot be is counted."""
-    places: dict[str, list[int]] = {}
-    for place, raw in enumerate(batch):
-        places.setdefault(raw.topic, []).append(place)
-    found: list[Message | None] = [None] * len(batch)
-    for name, at in places.items():
-        data = [batch[place].data for place in at]
-        made = decode_messages(topics[name].schema, data, contexts[name], dropped)
-        for place, message in zip(at, made, strict=True):
-            found[place] = message
-    for raw, message in zip(batch, found, strict=True):
-        if message is not None:
-            at_ns = raw.log_time_ns
-            if contexts[raw.topic].by_log_time:
-                yield raw.topic, replace(message, stamp_ns=at_ns, time_ns=at_ns), at_ns
-            else:
-                yield raw.topic, message, at_ns
-
-
-_STAMP_DEFECTS = {
-    time_order.GLITCH: "stamps contradict the order of recording; placed between their neighbours",
-    time_order.DUPLICATE: "messages repeat a stamp; kept",
-    time_order.TOO_LATE: "messages {late}",
-    time_order.REPEATED: "increments were recorded twice; the second of each was dropped",
-}
-
-
-def _stamp_warnings(reader: FileReader, topic: str, counts: Counter[str]) -> list[str]:
-    """One line per kind of defect among the stamps of a topic."""
-    late = time_order.late_text(reader.sorter.late_s(topic))
-    return [
-        f"{reader.file.path}: {topic}: {counts[kind]} {text.format(late=late)}"
-        for kind, text in _STAMP_DEFECTS.items()
-        if counts[kind]
     ]

@@ -45,8 +45,11 @@ _STAMPED = (records.Scan, records.Sighting, records.OdometryPose, records.WheelA
 _SENSING = (records.Scan, records.Sighting)
 #: share of the poses in which a base leans that are too many to be bumps
 SHARE_LEANING = 0.05
-#: bearings beyond a whole turn, how many at least and of all: they are no radians
+#: bearings beyond the largest, how many at least and of all: they are no radians
 LEAST_IN_DEGREES, SHARE_IN_DEGREES = 10, 0.25
+#: rad: that is a turn, rounded as drivers do; the beams of a scan may begin up to a turn from ahead
+#: and go all around
+MAX_BEARING_RAD, MAX_SCAN_ANGLE_RAD = 2.02 * np.pi, 4.04 * np.pi
 
 _NONE: Mapping[str, str] = {}
 
@@ -212,7 +215,9 @@ class _SensorFrames:
             )
             # angle_max is not what some drivers say
             last = first + step * [len(m.ranges) - 1 for m in messages]
-            findings += in_degrees(topic.name, [*first, *last], "angle_increment too")
+            findings += in_degrees(
+                topic.name, [*first, *last], "angle_increment too", MAX_SCAN_ANGLE_RAD
+            )
             no_return = find_no_return(message.ranges for message in messages)
             told["no_return_m"] = np.inf if no_return is None else no_return
         return told, findings
@@ -272,16 +277,18 @@ def leaning(topic: str, turns: Array) -> list[Finding]:
     return [Finding("doubt", "level", topic, text, remedy)]
 
 
-def in_degrees(topic: str, bearings: Sequence[float], too: str) -> list[Finding]:
+def in_degrees(
+    topic: str, bearings: Sequence[float], too: str, most_rad: float = MAX_BEARING_RAD
+) -> list[Finding]:
     """That the bearings of a source are no angles in radians, if they are in degrees.
 
-    ``too``: what else has to be written in radians then.
+    ``too``: what else has to be written in radians then. ``most_rad``: how large they may be.
 
     One that is not wrapped is at most a turn away from one that is; of those in degrees few are.
     """
     sizes = np.abs(bearings)
     sizes = sizes[np.isfinite(sizes)]
-    beyond = np.count_nonzero(sizes > 2 * np.pi)
+    beyond = np.count_nonzero(sizes > most_rad)
     if beyond < LEAST_IN_DEGREES or beyond < SHARE_IN_DEGREES * len(sizes) or sizes.max() > 360:
         return []
     text = f"its bearings are in degrees: up to {sizes.max():.0f}, where a whole turn is 6.28 rad"

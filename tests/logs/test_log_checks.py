@@ -207,6 +207,19 @@ def test_scans_in_degrees_are_refused_before_anything_is_computed(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("first", [0.0, -np.pi, np.pi / 2, -2 * np.pi, 2 * np.pi])
+def test_beams_all_around_are_radians_wherever_they_begin(tmp_path, first):
+    """0 to 6.28319 rad is a little more than a turn, as 2 π in single precision may be too."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.mount("robot", T0, (0, 0, 0))
+        for k in range(20):
+            log.odometry("robot", T0 + k * S, (k, 0, 0))
+            shape = {"angle_min_rad": first, "angle_step_rad": 6.28319 / 359, "range_max_m": 9.0}
+            log.scan("robot", T0 + k * S, np.full(360, 2.0), **shape)
+    assert len([m for m in open_logs([path], Config()).messages() if hasattr(m, "ranges")]) == 20
+
+
 @pytest.mark.parametrize("apart", [0.0, 0.5])
 def test_scans_of_two_lasers_on_one_topic_are_not_taken_for_those_of_one(tmp_path, apart):
     """Of a frame beside the first one they are left out, and it is said; if tf has both frames at
