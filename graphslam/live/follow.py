@@ -21,9 +21,9 @@ from graphslam.live.live_folder import write_live_folder
 from graphslam.live.live_pass import LiveEstimate
 from graphslam.live.session import INTRODUCTION_S, Session, live_config
 from graphslam.logs import LogSet
+from graphslam.logs.file_reader import FileReader, decoded
 from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.growing_mcap import GrowingMcap, open_growing
-from graphslam.logs.file_reader import FileReader, decoded
 from graphslam.logs.log_set import damage, log_set_of
 from graphslam.logs.recording import Recording, deriver
 from graphslam.logs.time_order import DROPPED, TOO_LATE, MessageSorter
