@@ -143,15 +143,13 @@ def _string(cursor: _Cursor) -> str:
 
 
 def string(raw: bytes) -> str:
-    """The text of a string with its end.
+    """The text of a string; its end, a zero byte, is not always written.
 
     Raises:
-        CdrError: it has none, or is no text.
+        CdrError: it is no text.
     """
-    if raw[-1:] != b"\0":
-        raise CdrError("a string has no end")
     try:
-        return raw[:-1].decode()
+        return raw.removesuffix(b"\0").decode()
     except UnicodeDecodeError as error:
         raise CdrError(str(error)) from error
 

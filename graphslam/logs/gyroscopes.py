@@ -51,29 +51,52 @@ def find_gyroscopes(
         names = imu_topics(files, robot, len(robots))
         if not (names and odometry):
             continue
-        tree = static_tree(files, robot, sampled_edges(files, robot))
-        times, rates = turn_rates(files, names[0], tree, base_frame(files, odometry[0]))
         wheels = _wheels(robot, files, config)
-        readings = list(odometry_readings(files, odometry[0], contexts[odometry[0].name]))
-        readings.sort(key=itemgetter(0))
-        at: IntArray = np.array([time for time, _ in readings], dtype=np.int64)
-        poses = np.array([reading for _, reading in readings])
-        if odometry[0].record is WheelAngles:
-            angles = poses.reshape(-1, 2)
-            poses = _path(np.unwrap(angles, axis=0) if robot in wrapped else angles, wheels)
-        turning = find_turning(names[0], times, rates, at, poses.reshape(-1, 3))
-        where = f"robot {robot}"
-        if isinstance(turning, str):
-            text = f"the gyroscope of {names[0]} is not used: {turning}"
-            remedy = "check its axes in /tf_static and its units"
-            findings.append(Finding("note", "gyroscope", where, text, remedy))
-        else:
-            found[robot] = replace(turning, wheels=wheels)
-            text = f"turning is that of the gyroscope of {names[0]}, less a bias of "
-            text += f"{turning.bias:.2g} rad/s and a delay of {1e3 * turning.late_s:.0f} ms"
-            remedy = "to leave it out: --set odometry.gyroscope=off"
-            findings.append(Finding("note", "gyroscope", where, text, remedy))
+        at, poses = _poses(files, odometry[0], contexts, wheels, robot in wrapped)
+        tree = static_tree(files, robot, sampled_edges(files, robot))
+        base = base_frame(files, odometry[0])
+        for name in names:
+            turning = find_turning(name, *turn_rates(files, name, tree, base), at, poses)
+            if isinstance(turning, Turning):
+                found[robot] = replace(turning, wheels=wheels)
+                findings.append(_used(robot, turning))
+                break
+            findings.append(_not_used(robot, name, turning))
     return found, findings
+
+
+def _used(robot: str, turning: Turning) -> Finding:
+    text = f"turning is that of the gyroscope of {turning.topic}, less a bias of "
+    text += f"{turning.bias:.2g} rad/s and a delay of {1e3 * turning.late_s:.0f} ms"
+    remedy = "to leave it out: --set odometry.gyroscope=off"
+    return Finding("note", "gyroscope", f"robot {robot}", text, remedy)
+
+
+def _not_used(robot: str, topic: str, why: str) -> Finding:
+    text = f"the gyroscope of {topic} is not used: {why}"
+    remedy = "check its axes in /tf_static and its units"
+    return Finding("note", "gyroscope", f"robot {robot}", text, remedy)
+
+
+def _poses(
+    files: Sequence[Recording],
+    topic: Topic,
+    contexts: Mapping[str, TopicContext],
+    wheels: RobotConfig,
+    wrapped: bool,
+) -> tuple[IntArray, Array]:
+    """Times (n,) ns and poses (n, 3) of an odometry of poses or of angles of ``wheels``.
+
+    ``wrapped``: the angles begin again after each turn.
+    """
+    readings = list(odometry_readings(files, topic, contexts[topic.name]))
+    readings.sort(key=itemgetter(0))
+    at: IntArray = np.array([time for time, _ in readings], dtype=np.int64)
+    found = np.array([reading for _, reading in readings])
+    if topic.record is WheelAngles:
+        angles = found.reshape(-1, 2)
+        found = _path(np.unwrap(angles, axis=0) if wrapped else angles, wheels)
+    return at, found.reshape(-1, 3)
 
 
 def _wheels(robot: str, files: Sequence[Recording], config: Config) -> RobotConfig:

@@ -51,7 +51,9 @@ def turn_rates(
             if frame not in axes:
                 axes[frame] = axis_above(tree, base, frame.decode(errors="replace").lstrip("/"))
             stamps = schemas.stamps_ns(rows)
-            rate = rows["rate"].astype(float) @ axes[frame]
+            axis = axes[frame]
+            # what it does not measure may be no number
+            rate = np.where(axis == 0.0, 0.0, rows["rate"].astype(float)) @ axis
             known = np.isfinite(rate) & (rows["rate_covariance"][:, 0] != -1.0)
             times.append(np.where(stamps == 0, log_times, stamps)[known])
             rates.append(rate[known])

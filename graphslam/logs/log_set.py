@@ -5,6 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
@@ -154,8 +156,8 @@ class LogSet:
         return self._contexts
 
     def mount(self, topic: str) -> Array:
-        """Pose (3,) of a laser in the base frame according to the log; of its first frame."""
-        return next(iter(self._contexts[topic].mounts.values()))
+        """Pose (3,) of a laser in the base frame by the log; of its first frame."""
+        return next(iter(self._contexts[topic].mounts.values()), np.zeros(3))
 
     def no_return_m(self, topic: str) -> float:
         """Smallest range, m, that means no return in ``topic``; inf if none was detected."""

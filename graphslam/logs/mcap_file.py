@@ -171,6 +171,7 @@ class Indexer:
             for offset, opcode, body in records_from(self.stream, self.position):
                 self.position = offset
                 self.add(offset, opcode, body)
+            self.look_behind(offset + RECORD.size + len(body) + len(MAGIC))
         except DAMAGE as error:
             self.recover(error)
         self.close_loose_block()
@@ -204,6 +205,14 @@ class Indexer:
         except DAMAGE as error:
             what = "chunk" if opcode == Opcode.CHUNK else "record"
             self.damage.append(f"the {what} at byte {offset} is damaged ({one_line(error)})")
+
+    def look_behind(self, end: int) -> None:
+        """Another recording may follow, where files were written one behind the other."""
+        self.stream.seek(end)
+        if self.stream.read(len(MAGIC)) == MAGIC:
+            rest = self.size - end
+            text = f"another recording begins behind its end, {rest} bytes, and is not read: "
+            self.damage.append(text + "store it as a file of its own")
 
     def add_message(self, offset: int, body: bytes) -> None:
         """Take in a message outside chunks."""

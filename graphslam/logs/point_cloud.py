@@ -43,7 +43,8 @@ def cloud_points(message: Any) -> Array:
     width, height = message.width, message.height
     data = np.ascontiguousarray(message.data).view(np.uint8)
     # rows may end with bytes that belong to no point
-    rows = data[: height * message.row_step].reshape(height, message.row_step)
+    step = message.row_step or width * message.point_step  # not always set
+    rows = data[: height * step].reshape(height, step)
     cells = np.ascontiguousarray(rows[:, : width * message.point_step])
     table = cells.reshape(-1).view(np.dtype(kind))
     points = np.stack([table[n].astype(float) for n in "xyz"], axis=1)

@@ -13,7 +13,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, polar_points
 from graphslam.logs import LogWriter, inspect_logs, open_logs, schemas
-from graphslam.logs.point_cloud import is_planar, sweep_of
+from graphslam.logs.point_cloud import cloud_points, is_planar, sweep_of
 
 
 def cloud(points: Array, stamp: int, code: int = 8, pad: int = 3) -> object:
@@ -40,6 +40,14 @@ def cloud(points: Array, stamp: int, code: int = 8, pad: int = 3) -> object:
         data=np.append(raw.ravel(), np.zeros(5, dtype=np.uint8)),
         is_dense=True,
     )
+
+
+def test_rows_whose_length_is_not_said_are_as_long_as_their_points():
+    """Some drivers leave ``row_step`` at zero."""
+    points = np.array([[1.0, 2.0, 0.1], [3.0, 4.0, 0.1]])
+    made = cloud(points, 0)
+    made.row_step = 0
+    np.testing.assert_array_equal(cloud_points(made), points)
 
 
 def as_clouds(log: Path, path: Path, height: float = 0.0) -> Path:

@@ -146,6 +146,18 @@ def test_a_real_bag_is_smoothed():
 # ---------------------------------------------------------------- damage
 
 
+def test_a_recording_behind_another_in_one_file_is_said_to_be_left_out(log, tmp_path):
+    """`cat a.mcap b.mcap`: the first one's footer ends what readers look at."""
+    both = tmp_path / "both.mcap"
+    both.write_bytes(2 * log.read_bytes())
+    recording = open_recording(both)
+    assert everything(recording) == everything(open_recording(log))
+    assert "another recording begins behind its end" in recording.damage
+    padded = tmp_path / "padded.mcap"
+    padded.write_bytes(log.read_bytes() + bytes(100))
+    assert not open_recording(padded).damage
+
+
 WHOLE = ["bare .db3", "ROS 1 bag", "ROS 1 bag, bz2", "ROS 1 bag, lz4", ".mcap.zstd"]
 
 

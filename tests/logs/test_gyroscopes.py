@@ -147,6 +147,25 @@ def test_what_is_no_gyroscope_of_this_robot_is_not_used(bad, tmp_path):
     assert isinstance(found, str) and why in found, found
 
 
+def test_the_first_usable_one_of_several_is_used(tmp_path):
+    """A camera's acceleration comes as an Imu without rates, more often than the gyroscope."""
+    times, poses, truth = drive()
+    at, rates = gyroscope(times, truth)
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        for time, pose in zip(times.tolist(), poses, strict=True):
+            log.odometry("robot", time, pose)
+            log.scan("robot", time, np.ones(9), angle_min_rad=0, angle_step_rad=0.1,
+                     range_max_m=9.0)  # fmt: skip
+        for time, rate in zip(at.tolist(), rates.tolist(), strict=True):
+            for k in range(2):
+                log.encoded("/a/accel", schemas.IMU, imu_bytes(time + k, "imu", np.nan), time)
+            log.encoded("/imu/data", schemas.IMU, imu_bytes(time, "imu", rate), time)
+    log = open_logs([path], Config())
+    assert log.gyroscopes["robot"].topic == "/imu/data"
+    assert any("/a/accel is not used: it has no readings" in line for line in log.warnings)
+
+
 def test_a_log_without_a_usable_gyroscope_is_read_to_the_bit_as_without_any(tmp_path):
     times, poses, truth = drive(seconds=60)
     at, rates = gyroscope(times, truth)

@@ -1,6 +1,7 @@
 """Other schemas: the same drive gives the same trajectory, whatever its messages are made of."""
 
 import json
+import struct
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +17,7 @@ import graphslam
 from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.logs import LogWriter, foxglove, open_logs, schemas
+from graphslam.logs.cdr import Decoder, Layout
 from graphslam.logs.cdr_writing import scan_bytes, tf_bytes
 from graphslam.logs.multi_echo import MULTI_ECHO
 from graphslam.logs.tf_tree import transforms_of
@@ -285,3 +287,17 @@ def test_what_is_written_is_what_the_reference_reads(frame):
     assert [tuple(t) for t in transforms_of(tf_bytes(transforms))] == transforms
     for transform in message.transforms:
         assert (transform.transform.translation.z, transform.transform.rotation.w) == (2, 6)
+
+
+@pytest.mark.parametrize("frame", [b"", b"laser"])
+def test_strings_without_their_end_are_read_alike_one_by_one_and_many_at_once(frame):
+    """Some writers leave the zero byte out. Were one way to refuse it, a laser would have no mount
+    though its scans are read."""
+    data = b"\0\1\0\0" + struct.pack("<iII", 5, 0, len(frame)) + frame
+    decoder = Decoder({"Header": "int32 sec\nuint32 nanosec\nstring frame_id"})
+    assert decoder.decode("Header", data).frame_id == frame.decode()
+    layout = Layout("<")
+    layout.number("sec", "i")
+    layout.number("nanosec", "I")
+    layout.string("frame", len(frame))
+    assert layout.table([data], ("frame",))["frame"].tolist() == [frame]
