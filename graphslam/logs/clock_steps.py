@@ -16,6 +16,7 @@ from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.topics import Topic
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
+_NO_END = np.iinfo(np.int64).max
 #: topic -> first and last time, ns, that its messages in a recording may have
 Spans = Mapping[str, tuple[int, int]]
 
@@ -34,7 +35,8 @@ def spans_of_stamps(
 
     Stamps between which no pause is longer than `LONGEST_PAUSE_NS` belong together. Used are those
     of which there are most in a sample of all topics, of equally many the later ones, and what is
-    as near to them. Topics without any of them, as those of another clock, are not in the result.
+    as near to them. Single later ones are left to the sorter, which knows what was recorded around
+    them. Topics without any of them, as those of another clock, are not in the result.
     """
     stamps: dict[str, IntArray] = {}
     for topic in topics:
@@ -49,6 +51,8 @@ def spans_of_stamps(
     groups = np.split(every, np.flatnonzero(np.diff(every) > LONGEST_PAUSE_NS) + 1)
     most = max(groups, key=lambda group: (len(group), group[0]))
     first, last = int(most[0]) - LONGEST_PAUSE_NS, int(most[-1]) + LONGEST_PAUSE_NS
+    if np.count_nonzero(every > last) < 2:
+        last = _NO_END
     return {
         name: (first, last)
         for name, own in stamps.items()

@@ -95,13 +95,17 @@ def _unused_schemas(log: CheckedLog) -> Iterable[Finding]:
 
 
 def _unreadable(log: CheckedLog) -> Iterable[Finding]:
+    moving = {topic.robot for topic in log.used if topic.schema in _MOVING}
+    scanned = {topic.robot for topic in log.used if topic.schema in _SCANS}
     for topic in log.topics:
-        if topic.used and topic.robot is not None and topic.count and topic.first_ns is None:
+        # without any other odometry such a one would be used
+        is_wanted = topic.used or (topic.schema in _MOVING and topic.robot not in moving)
+        if is_wanted and topic.robot is not None and topic.count and topic.first_ns is None:
             text = f"none of its {topic.count} messages can be used; see what was dropped"
-            others = any(
+            others = topic.robot in scanned or any(
                 other.robot == topic.robot and other.first_ns is not None
-                for other in log.topics
-                if other.used and other.schema in _MOVING
+                for other in log.used
+                if other.schema in _MOVING
             )
             how: Severity = "doubt" if others or topic.schema not in _MOVING else "unusable"
             remedy = _name_wheels(topic, log.config.robot(topic.robot)) if topic.joints else ""

@@ -97,7 +97,7 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         topics = find_topics(files, config)
         files, topics, derived = robots_and_topics(files, config)
         findings += derived
-        chosen, choices = choose_topics(files, topics)
+        chosen, choices = choose_topics(files, topics, config)
         lasers = further_lasers(files, topics, chosen, config)
         findings += [*choices, *lasers.findings]
     except LogError as error:

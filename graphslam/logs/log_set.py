@@ -328,7 +328,7 @@ def open_logs(paths: Sequence[Path], config: Config) -> LogSet:
 def log_set_of(files: Sequence[Recording], config: Config) -> LogSet:
     """Recordings as one log, see `open_logs`."""
     files, found, derived = robots_and_topics(files, config)
-    topics, choices = choose_topics(files, found)
+    topics, choices = choose_topics(files, found, config)
     contexts, assumed = topic_contexts(files, topics, config)
     for finding in assumed:
         if finding.severity == "unusable":

@@ -9,7 +9,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.suggestions import did_you_mean
 from graphslam.logs import schemas
-from graphslam.logs.decoders import DECODERS
+from graphslam.logs.decoders import DECODERS, TopicContext, decode_messages
 from graphslam.logs.findings import Finding, topics_setting
 from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.schemas import POINT_CLOUD
@@ -25,6 +25,8 @@ ODOMETRY_KINDS: tuple[type[records.Message], ...] = (
 # What tells how a robot moved: without odometry its scans, compared with each other.
 MOTION_KINDS = (*ODOMETRY_KINDS, records.Scan)
 
+#: blocks of a recording from which messages are taken, and how many from each
+_SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK = 4, 4
 #: last part of the name of a frame, in which poses jump by REP 105
 _JUMPING_FRAMES = ("map", "world", "earth")
 
@@ -111,7 +113,7 @@ def _nested(topics: Sequence[Topic]) -> list[Topic]:
 
 
 def choose_topics(
-    files: Sequence[Recording], topics: Sequence[Topic]
+    files: Sequence[Recording], topics: Sequence[Topic], config: Config
 ) -> tuple[list[Topic], list[Finding]]:
     """One odometry source and one laser per robot, all other topics, and findings.
 
@@ -136,6 +138,9 @@ def choose_topics(
         own.sort(key=lambda t: (t.schema == POINT_CLOUD, -t.count, t.name))
         odometry = _odometry_of(files, own)
         lasers = lasers_of(filled, robot)
+        if lasers:  # scans tell how it moved too
+            odometry, unusable = _with_usable_first(files, odometry, config)
+            findings += unusable
         sensors = lasers + [t for t in own if t.record is records.Sighting]
         if sensors and not odometry:
             if not lasers or _odometry_alone(filled):
@@ -179,6 +184,35 @@ def _odometry_of(files: Sequence[Recording], topics: Sequence[Topic]) -> list[To
     of_kind = {kind: [t for t in topics if t.record is kind] for kind in ODOMETRY_KINDS}
     of_kind[records.OdometryPose] = poses
     return [topic for own in of_kind.values() for topic in own]
+
+
+def _with_usable_first(
+    files: Sequence[Recording], topics: Sequence[Topic], config: Config
+) -> tuple[list[Topic], list[Finding]]:
+    """Sources of odometry of which a message can be used before the others; none if there is none.
+
+    Joints may be those of an arm, and a rotation of a pose may be none. What is left out is said.
+    """
+    usable = [topic for topic in topics if _is_usable(files, topic, config)]
+    if usable or not topics:
+        return usable + [topic for topic in topics if topic not in usable], []
+    text = "is no odometry: none of a sample of its messages can be used"
+    remedy = "check what publishes it"
+    if any(topic.record is records.WheelAngles for topic in topics):
+        remedy = "`graphslam info` lists its joints, and how to name a wheel of each side"
+    return [], [Finding("doubt", "odometry", topic.name, text, remedy) for topic in topics]
+
+
+def _is_usable(files: Sequence[Recording], topic: Topic, config: Config) -> bool:
+    """Whether some message of a sample can be used."""
+    own = config.robot(topic.robot)
+    context = TopicContext(topic.robot, left_joint=own.left_joint, right_joint=own.right_joint)
+    for file in files:
+        data = list(sample_messages(file, topic.name, _SAMPLE_BLOCKS, _SAMPLE_PER_BLOCK))
+        found = decode_messages(topic.schema, data, context, Counter()) if data else []
+        if any(message is not None for message in found):
+            return True
+    return False
 
 
 def _jumps(files: Sequence[Recording], topic: Topic) -> bool:

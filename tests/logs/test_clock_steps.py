@@ -29,6 +29,7 @@ KNOWN = [T0 + k * S for k in range(100)]
 CASES = {
     "first stamps of zero": ([0, 0], KNOWN, 4),
     "a clock that begins in 1970": (BOOTED, KNOWN, 40),
+    "a clock that was years ahead": ([t + 9 * YEAR for t in KNOWN[:30]], KNOWN[30:], 60),
     "set by a year": ([t - YEAR for t in KNOWN[:30]], KNOWN[30:], 60),
 }
 

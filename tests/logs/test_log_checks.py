@@ -353,7 +353,8 @@ def test_joints_of_four_wheels_are_listed_with_the_options_that_name_two(robot, 
     path = joints(tmp_path / "log.mcap", wheels)
     topics = f'logs.topics={{"/scan" = "{robot}", "/joint_states" = "{robot}"}}'
     info = inspect_logs([path], load_config(None, [topics]))
-    (found,) = [f for f in info.findings if f.severity == "unusable"]
+    (found,) = [f for f in info.findings if f.check == "messages"]
+    assert found.severity == "doubt"  # scan matching tells how it moved
     assert all(name in found.text for name in [*wheels, "arm_joint"])
     options = shlex.split(found.remedy)
     settings = [after for option, after in itertools.pairwise(options) if option == "--set"]
@@ -367,9 +368,20 @@ def test_joints_of_four_wheels_are_listed_with_the_options_that_name_two(robot, 
 
 def test_joints_that_are_no_wheels_are_listed_and_known_wheels_are_not(tmp_path):
     info = inspect_logs([joints(tmp_path / "a.mcap", ["slide_1", "slide_2"])], Config())
-    (found,) = [f for f in info.findings if f.severity == "unusable"]
+    (found,) = [f for f in info.findings if f.check == "messages"]
     assert "arm_joint, slide_1, slide_2" in found.text
     assert "robots.robot.left_joint=NAME" in found.remedy
-    assert inspect_logs(
-        [joints(tmp_path / "b.mcap", ["wheel_left", "wheel_right"])], Config()
-    ).usable
+    other = inspect_logs([joints(tmp_path / "b.mcap", ["wheel_left", "wheel_right"])], Config())
+    assert other.usable and "messages" not in [f.check for f in other.findings]
+
+
+def test_scans_are_matched_where_no_odometry_can_be_used(tmp_path):
+    """An arm's joints, alone or beside wheels whose names tell no side, are no odometry; and where
+    they come more often than wheels that are, these are used."""
+    path = joints(tmp_path / "a.mcap", ["pan", "tilt"])
+    log = open_logs([path], Config())
+    assert log.without_odometry == ("robot",)
+    assert any("/joint_states: is no odometry" in line for line in log.warnings)
+    assert len([m for m in log.messages() if isinstance(m, records.Scan)]) == 60
+    log = open_logs([joints(tmp_path / "b.mcap", ["wheel_left", "wheel_right"])], Config())
+    assert not log.without_odometry
