@@ -12,6 +12,7 @@ from graphslam.logs import bag_file, mcap_file, sqlite_file
 from graphslam.logs.container_files import is_compressed, open_file
 from graphslam.logs.recording import Piece, Recording
 from graphslam.logs.rosbag2_metadata import METADATA, Metadata, read_metadata
+from graphslam.logs.source_files import unpacked_beginning
 
 
 class Container(NamedTuple):
@@ -76,7 +77,10 @@ def _indexed(path: Path, limits: LimitsConfig) -> Piece:
 
 def _container_of(path: Path) -> Container | None:
     with open_file(path) as stream:
-        begin = stream.read(_LONGEST)
+        return _container_that_begins(stream.read(_LONGEST))
+
+
+def _container_that_begins(begin: bytes) -> Container | None:
     rows = CONTAINERS.values()
     return next((row for row in rows if begin.startswith(row.magic)), None)
 
@@ -93,7 +97,12 @@ def _what_it_is(path: Path) -> str:
         return "is a bag of an old version; `rosbag fix` makes one of version 2.0 of it"
     for magic, name in _PACKED.items():
         if begin.startswith(magic):
-            return f"is packed with {name}; unpack it, or `graphslam import` it"
+            # recordings, which `graphslam import rosbag` reads, are none of the formats that are
+            # imported packed
+            recording = _container_that_begins(unpacked_beginning(path, name, _LONGEST))
+            return f"is packed with {name}; unpack it" + (
+                "" if recording else ", or `graphslam import` it"
+            )
     if path.name == METADATA:
         return "is the description of a recording; name the folder that it is in"
     return (

@@ -33,6 +33,8 @@ _Pose = tuple[float, float, float]
 
 _TRAILER = 3  # fields at the end: ipc time, host, logger time
 _SAMPLE_EVERY = 20  # every 20th scan is searched for the no-return value
+#: with so many lines of lasers of which none can be read a log is of another format
+_MANY_LINES = 10
 #: m and rad within which the pose of a laser on the robot must stay to be its mount
 _MOUNT_SPREAD = 1e-3
 #: lasers by the number in the names of their lines: frame, usual heading on the robot
@@ -82,7 +84,8 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
     keep the order of the file.
 
     Raises:
-        LogError: ``source`` cannot be read, or holds neither scans nor odometry.
+        LogError: ``source`` cannot be read, holds neither scans nor odometry, or many lines of
+            lasers of which none can be read.
         OutputError: ``target`` cannot be written.
     """
     malformed: Counter[str] = Counter()
@@ -94,6 +97,12 @@ def import_carmen(source: Path, target: Path) -> ImportSummary:
         raise LogError(
             f"{source}: has no readable line of a laser (FLASER, ROBOTLASER1) or ODOM line; is it "
             "CARMEN? Name the log"
+        )
+    unreadable = sum(count for tag, count in malformed.items() if tag in _SCANS)
+    if unreadable >= _MANY_LINES and not any(isinstance(entry, _Scan) for entry in stamped):
+        raise LogError(
+            f"{source}: none of its {unreadable} lines of lasers can be read; they must have as "
+            "many ranges as they state, and end with ipc time, host and logger time"
         )
     stamped, notes = _once(stamped)
     log_times = recording_times([entry.stamp_ns for entry in stamped])

@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from functools import partial
+from io import BufferedIOBase
 from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import TextIO, TypeVar
@@ -17,6 +18,11 @@ from typing import TextIO, TypeVar
 from graphslam.core.errors import LogError
 
 _OPENERS: dict[str, Callable[..., TextIO]] = {".bz2": bz2.open, ".gz": gzip.open, ".xz": lzma.open}
+_UNPACKERS: dict[str, Callable[..., BufferedIOBase]] = {
+    "gzip": gzip.GzipFile,
+    "bzip2": bz2.BZ2File,
+    "xz": lzma.LZMAFile,
+}
 _ARCHIVE_SUFFIXES = {".zip", ".tar", ".tgz", ".tbz2", ".txz", *_OPENERS}
 _T = TypeVar("_T")
 
@@ -42,14 +48,15 @@ MOST_BYTES = 2_000_000_000
 def text_lines(path: Path) -> Iterator[str]:
     """Lines of a text file, plain or compressed with gzip, bzip2 or xz.
 
-    Bytes that are not UTF-8 are replaced: old logs have comments in any encoding.
+    Bytes that are not UTF-8 are replaced: old logs have comments in any encoding. A byte-order mark
+    is no part of the first line.
 
     Raises:
         LogError: no such file, a directory, or not readable to its end.
     """
     try:
         opener = _OPENERS.get(path.suffix, open)
-        with opener(path, "rt", encoding="utf-8", errors="replace") as lines:
+        with opener(path, "rt", encoding="utf-8-sig", errors="replace") as lines:
             yield from lines
     except IsADirectoryError as error:
         raise LogError(f"{path}: is a directory; name the log in it") from error
@@ -68,16 +75,19 @@ def first_and_all(items: Iterator[_T], if_empty: str) -> tuple[_T, Iterator[_T]]
     raise LogError(if_empty)
 
 
-def text_files(source: Path, names: re.Pattern[str]) -> dict[str, str]:
+def text_files(
+    source: Path, names: re.Pattern[str], others: list[str] | None = None
+) -> dict[str, str]:
     """Texts of all files in a folder or archive whose base name matches, at any depth.
 
     Args:
         source: a folder, a .zip or a .tar (plain or with any compression that Python knows);
             archives are read without unpacking.
         names: pattern that a base name must match in full.
+        others: where base names of the other files are appended.
 
     Returns:
-        Base name -> text; bytes that are not UTF-8 are replaced.
+        Base name -> text; bytes that are not UTF-8 are replaced, and a byte-order mark is left out.
 
     Raises:
         LogError: no such file, not readable to its end, or two files of the same name.
@@ -87,13 +97,15 @@ def text_files(source: Path, names: re.Pattern[str]) -> dict[str, str]:
         for path, read in _members(source):
             name = PurePosixPath(path).name
             if not names.fullmatch(name):
+                if others is not None:
+                    others.append(name)
                 continue
             if name in texts:
                 raise LogError(f"{source}: holds two files {name}; name the folder of one data set")
             text = read()
             if len(text) > MOST_BYTES:
                 raise LogError(f"{source}: {name} is larger than 2 GB when unpacked; is it a log?")
-            texts[name] = text.decode("utf-8", errors="replace")
+            texts[name] = text.decode("utf-8-sig", errors="replace")
     except _READ_ERRORS as error:
         raise unreadable(source, error) from error
     return texts
@@ -122,6 +134,23 @@ def _members(source: Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
 def _unpack(packed: zipfile.ZipFile, name: str) -> bytes:
     with packed.open(name) as stream:
         return stream.read(1 + MOST_BYTES)
+
+
+def unpacked_beginning(path: Path, packing: str, size: int) -> bytes:
+    """The first ``size`` bytes of what is packed in ``path``; none if they cannot be unpacked.
+
+    ``packing`` is gzip, bzip2, xz or zip; of a .zip it is the first file.
+    """
+    try:
+        if packing == "zip":
+            with zipfile.ZipFile(path) as packed:
+                first = next(name for name in packed.namelist() if not name.endswith("/"))
+                with packed.open(first) as stream:
+                    return stream.read(size)
+        with _UNPACKERS[packing](path, "rb") as stream:
+            return stream.read(size)
+    except (*_READ_ERRORS, StopIteration):
+        return b""
 
 
 def unreadable(source: Path, error: Exception) -> LogError:

@@ -1,8 +1,13 @@
 """Containers: a drive is the same from any of them, damaged ones are read as far as they go."""
 
+import bz2
+import gzip
+import io
+import lzma
 import shutil
 import sqlite3
 import struct
+import zipfile
 from functools import cache
 from pathlib import Path
 
@@ -314,7 +319,18 @@ def test_messages_of_an_unfinished_database_are_read(log, tmp_path):
 # ---------------------------------------------------------------- what cannot be read
 
 
-def test_what_cannot_be_read_says_in_one_line_what_to_do(made, tmp_path):
+def _zipped(data: bytes) -> bytes:
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        archive.mkdir("drive")
+        archive.writestr("drive/log", data)
+    return made.getvalue()
+
+
+PACKERS = {".gz": gzip.compress, ".bz2": bz2.compress, ".xz": lzma.compress, ".zip": _zipped}
+
+
+def test_what_cannot_be_read_says_in_one_line_what_to_do(made, log, tmp_path):
     def refusal(name: str, data: bytes) -> str:
         path = tmp_path / name
         path.write_bytes(data)
@@ -326,6 +342,10 @@ def test_what_cannot_be_read_says_in_one_line_what_to_do(made, tmp_path):
     assert "empty file" in refusal("empty.bag", b"")
     assert "rosbag fix" in refusal("old.bag", b"#ROSBAG V1.2\n" + bytes(100))
     assert "unpack it" in refusal("log.bag.gz", b"\x1f\x8b" + bytes(100))
+    for suffix, pack in PACKERS.items():
+        told = refusal(f"drive.mcap{suffix}", pack(log.read_bytes()))
+        assert told.endswith("unpack it")  # `graphslam import` reads no packed recordings
+        assert "graphslam import" in refusal(f"intel.clf{suffix}", pack(b"# CARMEN Logfile\n"))
     assert "graphslam import" in refusal("intel.clf", b"# CARMEN Logfile\nODOM 1 2 3\n")
     assert "name the folder" in refusal("metadata.yaml", b"rosbag2_bagfile_information:\n")
     assert "damaged at its beginning" in refusal("log.db3.zstd", b"\x28\xb5\x2f\xfd" + bytes(50))
