@@ -9,22 +9,24 @@ A folder or archive with, per robot:
 - ``laser.csv``: x m, y m, heading rad of the laser on the base; without it the base itself.
 - ``truth.csv`` or ``truth.tum``: true poses, as odometry.
 
-Files of several robots are called ``NAME.odometry.csv``. Columns of a file are separated by
-semicolons, and then decimal commas may be used, else by commas, else by blanks; lines of poses have
-as many columns as each other. Lines that begin with ``#`` and a first line of names are left out.
+Files of several robots are called ``NAME.odometry.csv``; upper and lower case are the same. Columns
+of a file are separated by semicolons or tabs, and then decimal commas may be used, else by commas,
+else by blanks; lines of poses have as many columns as each other. A first line of names may state
+another order of columns (`csv_columns`). Lines that begin with ``#`` are left out.
 """
 
 import math
 import re
-from collections import Counter
-from collections.abc import Callable, Sequence
-from functools import partial
-from pathlib import Path
-from typing import TypeVar
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from graphslam.core.errors import LogError
+from graphslam.logs import csv_units
+from graphslam.logs.csv_columns import MOUNT, POSES, SCANS, TUM_POSES, Columns, Kind, columns_of
+from graphslam.logs.csv_tables import Table, read_table
 from graphslam.logs.import_carmen import finite, parse_stamp_ns
 from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.physical_limits import MAX_RANGE_M
@@ -32,142 +34,169 @@ from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_files
 from graphslam.logs.writer import Event, LogWriter
 
-_FILES = re.compile(r"(?:(?P<robot>.+)\.)?(?P<what>odometry|scans|laser|truth)\.(?P<kind>csv|tum)")
-#: characters with which a number begins
-_NUMERIC = frozenset("0123456789+-.")
+_FILES = re.compile(
+    r"(?:(?P<robot>.+)\.)?(?P<what>odometry|scans|laser|truth)\.(?P<kind>csv|tum)", re.IGNORECASE
+)
+_CALLED = "odometry.csv or .tum, scans.csv, laser.csv, truth.csv or .tum, or NAME.odometry.csv"
+#: so many files that are not used are named
+_MOST_TOLD = 10
 
 Pose = tuple[float, float, float]
 _T = TypeVar("_T")
+
+
+class _File(NamedTuple):
+    """A table: its name and text, whose it is, and what it has."""
+
+    name: str
+    text: str
+    robot: str
+    what: str
+    kind: str
 
 
 def import_csv(source: Path, target: Path) -> ImportSummary:
     """Convert the tables in ``source`` (a folder, .zip or .tar) to the MCAP file ``target``.
 
     Raises:
-        LogError: ``source`` cannot be read, has none of the files, or a file has no usable line.
+        LogError: ``source`` cannot be read, has none of the files, or two of one kind for a robot;
+            a file has no usable line, or names of columns that leave one open.
         OutputError: ``target`` cannot be written.
     """
-    texts = text_files(source, _FILES)
-    if not any("odometry" in name for name in texts):
+    files, others = _files(source)
+    if not any(file.what == "odometry" for file in files):
+        there = f"; it has {_some(others)}" if others else ""
         raise LogError(
-            f"{source}: has no odometry.csv (stamp s, x m, y m, heading rad) or odometry.tum; "
-            "is it a folder of tables?"
+            f"{source}: has no odometry.csv (stamp s, x m, y m, heading rad) or odometry.tum"
+            f"{there}; is it a folder of tables?"
         )
     events: list[Event] = []
     mounts: dict[str, Pose] = {}
     warnings = []
-    for name, text in sorted(texts.items()):
-        found = _FILES.fullmatch(name)
-        assert found is not None  # `text_files` gives no others
-        robot = found["robot"] or DEFAULT_ROBOT
-        if found["what"] == "laser":
-            own_mounts, unreadable = _parsed(text, _numbers, same_width=True)
+    if others:
+        are = "is" if len(others) == 1 else "are"
+        warnings.append(f"{_some(others)} {are} not used: files are called {_CALLED}")
+    for file in files:
+        name = f"{source}: {file.name}"
+        table = read_table(file.text, same_width=file.what != "scans")
+        if file.what == "laser":
+            columns = columns_of("mount", table.names, MOUNT, name)
+            own_mounts, unreadable = _parsed(table, columns, _pose)
             if not own_mounts:
                 raise LogError(
-                    f"{source}: {name} has no usable line; it is x m, y m, heading rad of the "
+                    f"{name} has no usable line; it is x m, y m, heading rad of the "
                     "laser on the base; without the file the laser is at the base itself"
                 )
-            mounts[robot] = own_mounts[0]
+            mounts[file.robot] = own_mounts[0]
         else:
-            parse = _event(found["what"], found["kind"], robot)
-            own, unreadable = _parsed(text, parse, same_width=found["what"] != "scans")
-            if not own:
-                raise LogError(
-                    f"{source}: {name} has no usable line; stamps are seconds, all numbers "
-                    "decimal, with commas only if ; is between the columns, and lines of poses "
-                    "have as many columns as their names"
-                )
+            own, unreadable, doubts = _events(file, table, name)
             events += own
+            warnings += [f"{file.name}: {doubt}" for doubt in doubts]
         if unreadable:
-            warnings.append(f"{source}: {unreadable} lines of {name} cannot be read")
+            warnings.append(f"{unreadable} lines of {file.name} cannot be read")
     events.sort(key=lambda event: event.stamp_ns)
     with LogWriter(target, {"format": "csv", "source": source.name}) as log:
         for robot, mount in mounts.items():
             log.mount(robot, events[0].stamp_ns, mount)
         for event in events:
             event.write(log)
-    return ImportSummary(source, target, log.counts, tuple(warnings))
+    told = tuple(f"{source}: {warning}" for warning in warnings)
+    return ImportSummary(source, target, log.counts, told)
+
+
+def _files(source: Path) -> tuple[list[_File], list[str]]:
+    """The tables in ``source`` by name, and the names of tables that are called otherwise.
+
+    Raises:
+        LogError: it cannot be read, or has two files with the same of one robot.
+    """
+    others: list[str] = []
+    texts = text_files(source, _FILES, others)
+    files: dict[tuple[str, str], _File] = {}
+    for name, text in sorted(texts.items()):
+        found = _FILES.fullmatch(name)
+        assert found is not None  # `text_files` gives no others
+        robot, what = found["robot"] or DEFAULT_ROBOT, found["what"].lower()
+        file = _File(name, text, robot, what, found["kind"].lower())
+        other = files.setdefault((robot, what), file)
+        if other is not file:
+            raise LogError(f"{source}: has both {other.name} and {name}; leave one of them")
+    suffixes = (".csv", ".tum")
+    tables = {name for name in others if PurePosixPath(name).suffix.lower() in suffixes}
+    # archives made by macOS have a hidden file beside each
+    return list(files.values()), sorted(name for name in tables if not name.startswith("."))
+
+
+def _some(names: list[str]) -> str:
+    """The names, or the first of very many."""
+    more = len(names) - _MOST_TOLD
+    return ", ".join(names[:_MOST_TOLD]) + (f" and {more} more" if more > 0 else "")
+
+
+def _events(file: _File, table: Table, name: str) -> tuple[list[Event], int, list[str]]:
+    """The records of a table, how many lines cannot be read, and doubts about its units.
+
+    Raises:
+        LogError: no line can be read, or its names of columns leave one open.
+    """
+    kind: Kind = "scans" if file.what == "scans" else "poses"
+    usual = SCANS if kind == "scans" else TUM_POSES if file.kind == "tum" else POSES
+    columns = columns_of(kind, table.names, usual, name)
+    doubts: list[str] = []
+    if kind == "scans":
+        own, unreadable = _parsed(table, columns, lambda fields: _scan(file.robot, fields))
+    else:
+        poses, unreadable = _parsed(table, columns, _stamped_pose)
+        method = LogWriter.truth if file.what == "truth" else LogWriter.odometry
+        own = [Event.of(method, file.robot, stamp_ns, pose=pose) for stamp_ns, pose in poses]
+        doubts = _doubts(file, columns, poses)
+    if not own:
+        raise LogError(
+            f"{name} has no usable line; stamps are seconds, all numbers decimal, with commas only "
+            "if ; or a tab is between the columns, and lines of poses have as many columns as "
+            "their names"
+        )
+    return own, unreadable, doubts
 
 
 def _parsed(
-    text: str, parse: Callable[[list[str]], _T], *, same_width: bool
+    table: Table, columns: Columns, parse: Callable[[list[str]], _T]
 ) -> tuple[list[_T], int]:
-    """What ``parse`` makes of each line, and how many lines it cannot read.
-
-    A first line of names is none of these. With ``same_width`` lines that have not as many columns
-    as the names, or as most, cannot be read: a comma in them may be a decimal one.
-    """
-    lines = [line.strip() for line in text.removeprefix("\ufeff").splitlines()]
-    lines = [line for line in lines if line and not line.startswith("#")]
-    separator = _separator(lines)
-    width = _width(lines, separator) if same_width else None
+    """What ``parse`` makes of the columns of each line, and how many lines it cannot read."""
     made, unreadable = [], 0
-    for number, line in enumerate(lines):
-        fields = _fields(line, separator)
+    for fields in table.rows():
         try:
-            if width not in (None, len(fields)):
+            if fields is None:
                 raise ValueError("another number of columns")
-            made.append(parse(fields))
+            made.append(parse(columns.of(fields)))
         except (ValueError, IndexError):
-            unreadable += number > 0 or _is_numeric(line)
+            unreadable += 1
     return made, unreadable
 
 
-def _separator(lines: Sequence[str]) -> str | None:
-    """What is between the columns of most lines of numbers; None: blanks."""
-    numeric = [line for line in lines if _is_numeric(line)]
-    for separator in (";", ","):
-        if 2 * sum(separator in line for line in numeric) > len(numeric):
-            return separator
-    return None
+def _doubts(file: _File, columns: Columns, poses: list[tuple[int, Pose]]) -> list[str]:
+    """Questions about units that the names of columns do not state."""
+    doubts = []
+    # true poses may be a few that were surveyed
+    if file.what == "odometry" and "stamp" not in columns.with_unit:
+        doubts.append(csv_units.milliseconds(np.array([1e-9 * stamp_ns for stamp_ns, _ in poses])))
+    if len(columns.picked) == len(POSES.picked) and "heading" not in columns.with_unit:
+        rows = np.array([pose for _, pose in sorted(poses)]).reshape(-1, 3)
+        doubts.append(csv_units.degrees(rows))
+    return [doubt for doubt in doubts if doubt]
 
 
-def _fields(line: str, separator: str | None) -> list[str]:
-    """The columns of a line; next to semicolons a comma is that of a decimal number."""
-    if separator == ";":
-        line = line.replace(",", ".")
-    return [field.strip() for field in line.split(separator)]
+def _stamped_pose(fields: list[str]) -> tuple[int, Pose]:
+    """Stamp ns, and the pose."""
+    return parse_stamp_ns(fields[0]), _pose(fields[1:])
 
 
-def _width(lines: Sequence[str], separator: str | None) -> int:
-    """How many columns the lines have: as many as names, where these are separated like numbers."""
-    if lines and not _is_numeric(lines[0]) and separator is not None and separator in lines[0]:
-        return len(_fields(lines[0], separator))
-    widths = Counter(len(_fields(line, separator)) for line in lines if _is_numeric(line))
-    return widths.most_common(1)[0][0] if widths else 0
-
-
-def _is_numeric(line: str) -> bool:
-    return line[0] in _NUMERIC
-
-
-def _event(what: str, kind: str, robot: str) -> Callable[[list[str]], Event]:
-    """What makes an event of the fields of a line."""
-    if what == "scans":
-        return partial(_scan, robot)
-    method = LogWriter.truth if what == "truth" else LogWriter.odometry
-    return partial(_pose_event, method, robot, _tum_pose if kind == "tum" else _numbers)
-
-
-def _pose_event(
-    method: Callable[..., None],
-    robot: str,
-    pose_of: Callable[[list[str]], Pose],
-    fields: list[str],
-) -> Event:
-    stamp_ns = parse_stamp_ns(fields[0])
-    return Event.of(method, robot, stamp_ns, pose=pose_of(fields[1:]))
-
-
-def _numbers(fields: list[str]) -> Pose:
-    """X m, y m, heading rad; more columns are left out."""
-    x, y, phi = map(finite, fields[:3])
-    return x, y, phi
-
-
-def _tum_pose(fields: list[str]) -> Pose:
-    """The planar part of x y z m and the quaternion x y z w."""
-    x, y, _, qx, qy, qz, qw = map(finite, fields[:7])
+def _pose(fields: list[str]) -> Pose:
+    """X m, y m, heading rad; or the planar part of x y m and the quaternion x y z w."""
+    x, y, *rotation = map(finite, fields)
+    if len(rotation) == 1:
+        return x, y, rotation[0]
+    qx, qy, qz, qw = rotation
     phi = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
     return x, y, phi
 

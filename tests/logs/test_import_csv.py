@@ -1,4 +1,7 @@
-"""Tables: the same drive as CSV and TUM gives the same records, and odd lines are counted."""
+"""Tables: the same drive as CSV and TUM gives the same records, and odd lines are counted.
+
+Names of columns, their units and names of files are in `test_csv_names.py`.
+"""
 
 import numpy as np
 import pytest
@@ -100,7 +103,12 @@ POSES = np.column_stack(
 @pytest.mark.parametrize("names", ["", "# a log\n\nstamp{0}x{0}y{0}phi\n", "\ufeff"])
 @pytest.mark.parametrize(
     ("separator", "decimal"),
-    [(";", ","), (" ; ", ","), *((s, ".") for s in (";", ",", " , ", ", ", "  ", "\t"))],
+    [
+        (";", ","),
+        (" ; ", ","),
+        ("\t", ","),
+        *((s, ".") for s in (";", ",", " , ", ", ", "  ", "\t")),
+    ],
 )
 def test_columns_are_separated_by_one_thing_in_a_file(names, separator, decimal, tmp_path):
     """With semicolons numbers may have decimal commas, as spreadsheets of many countries write."""
@@ -115,6 +123,7 @@ def test_columns_are_separated_by_one_thing_in_a_file(names, separator, decimal,
     [
         "stamp,x,y,phi\n" + "0,1,0,01,0,0,0,0\n" * 5,  # decimal commas between commas
         "0,1 0,01 0,0 0,0\n" * 5,  # and between blanks
+        "0,1\t 0,01 \t0,0 0,0\n" * 5,  # some of which are tabs
     ],
 )
 def test_decimal_commas_that_cannot_be_told_are_refused(text, tmp_path):
@@ -135,5 +144,34 @@ def test_a_line_of_poses_with_another_number_of_columns_is_counted(tmp_path):
 def test_a_mount_that_cannot_be_read_is_not_that_of_a_laser_at_the_base(text, log, tmp_path):
     source = tables(log, tmp_path / "tables", "csv")
     (source / "laser.csv").write_text(text)
-    with pytest.raises(LogError, match=r"laser.csv has no usable line.*x m, y m, heading rad"):
+    why = r"laser.csv (has no usable line|names its columns x, y).*x m, y m, heading rad"
+    with pytest.raises(LogError, match=why):
         IMPORTERS["csv"](source, tmp_path / "log.mcap")
+
+
+def test_empty_columns_between_tabs_are_beams_without_return(tmp_path):
+    """Also the first and the last; they are not merged, and lines of comments stay comments."""
+    (tmp_path / "odometry.csv").write_text(" \t# poses\n\t\n1.0\t0,5\t0\t0,25\n")
+    (tmp_path / "scans.csv").write_text("1.0\t-0,5\t0,1\t\t\t2,5\t\t3\t\t\r\n")
+    assert IMPORTERS["csv"](tmp_path, tmp_path / "log.mcap").warnings == ()
+    odometry, scan = open_logs([tmp_path / "log.mcap"], Config()).messages()
+    assert tuple(odometry.pose) == (0.5, 0.0, 0.25)
+    nothing = np.nan
+    np.testing.assert_array_equal(
+        np.where(np.isfinite(scan.ranges), scan.ranges, nothing),
+        [nothing, nothing, 2.5, nothing, 3.0, nothing, nothing],
+    )
+    assert (scan.angle_min_rad, scan.angle_step_rad) == pytest.approx((-0.5, 0.1))
+
+
+def test_a_line_that_begins_with_a_tab_has_no_stamp(tmp_path):
+    """Its first column is empty: the next one is not taken for the stamp."""
+    (tmp_path / "odometry.csv").write_text("1\t0\t0\t0\t9\n" * 3 + "\t2\t0\t0\t0\t0\n")
+    summary = IMPORTERS["csv"](tmp_path, tmp_path / "log.mcap")
+    assert summary.counts["/odom"] == 3
+    assert "1 lines of odometry.csv cannot be read" in summary.warnings[0]
+
+
+def test_tabs_behind_commas_align_columns(tmp_path):
+    found = poses_of(tmp_path, "log", "0.5,\t1.5,\t0.5,\t0.25\n" * 3)
+    assert {f[1:] for f in found} == {(1.5, 0.5, 0.25)}
