@@ -162,14 +162,15 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
         own = parts == part
         z1, z2, motion = seen.z[a[own]], seen.z[b[own]], moved[own]
         plain = float(_disagreement(z1, z2, motion))
-        if plain < TOLERANCE:
+        uncertain = float(np.median(noise[own]))
+        if plain < max(TOLERANCE, uncertain):  # what was not measured may be anything
             continue
         some = slice(None, None, 1 + len(z1) // MOST)
         tried = _explained(z1[some], z2[some], motion[some])
         best = min(tried, key=lambda text: tried[text])
         what = best
         if tried[best] > BETTER * plain:
-            if plain < 3 * float(np.median(noise[own])):
+            if plain < 3 * uncertain:
                 continue  # it is noise
             what = CONTRADICTION
         found.setdefault(what, []).append(int(seen.times_ns[a[own]][0]))

@@ -43,6 +43,8 @@ MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
 CONVERGED_ERROR = 1e-4
 #: smallest factor on a stated variance on the way, for logs without noise
 MIN_VARIANCE = 1e-4
+#: rad: a bearing that is stated to be less certain was not measured
+UNKNOWN_BEARING_RAD = 1.0
 #: sightings without which nothing is said about a source
 MIN_MEASUREMENTS = 100
 
@@ -182,11 +184,25 @@ def _sighting_noise(
             continue
         found, shared = fit_distribution(residuals.normalised), posterior.shared(source)
         part = np.zeros(2) if shared is None else shared_variance(shared) * before.shared
-        white = np.maximum(found.variance * before.white, MIN_VARIANCE)
+        least = np.where(_is_measured(posterior, source), MIN_VARIANCE, 1.0)
+        white = np.maximum(found.variance * before.white, least)
         new[source] = ObservationNoise(white, part, found.kernel_scale)
     for source in noise.keys() - new.keys():
         new[source] = new[source[0], "point"]
     return new
+
+
+def _is_measured(posterior: Posterior, source: Source) -> Array:
+    """Whether the bearings and the ranges (2,) of a source are stated to be measured at all.
+
+    A sigma as large as the ranges themselves, or of a radian, says that what stands there is not:
+    a camera that sees bearings alone writes some constant. It may repeat itself, but that it hardly
+    differs from what is estimated is no measurement of anything.
+    """
+    seen = [a for *_, a in posterior.builder.bearings_and_ranges[source]]
+    sigmas = np.sqrt([np.diag(a.cov) for a in seen])
+    ranges = np.array([a.z[1] for a in seen])
+    return np.asarray(np.median(sigmas, axis=0) < [UNKNOWN_BEARING_RAD, np.median(ranges)])
 
 
 def _cautious(found: ObservationNoise, config: Config) -> ObservationNoise:
