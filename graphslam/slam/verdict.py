@@ -17,6 +17,7 @@ from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence
 from graphslam.slam.moved_points import moved_doubts
 from graphslam.slam.odometry_doubts import odometry_doubts
+from graphslam.slam.regular_landmarks import regular_landmark_doubts
 from graphslam.slam.scan_doubts import scan_doubts
 from graphslam.slam.sighting_doubts import sighting_doubts
 from graphslam.slam.told_starts import contradictions
@@ -230,6 +231,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "odometry": odometry_doubts,
     "scans": scan_doubts,
     "sightings": sighting_doubts,
+    "regular landmarks": regular_landmark_doubts,
     "points": vanished_doubts,
     "moved": moved_doubts,
     "noise": _noise,
