@@ -51,6 +51,9 @@ LEAST_IN_DEGREES, SHARE_IN_DEGREES = 10, 0.25
 #: and go all around
 MAX_BEARING_RAD, MAX_SCAN_ANGLE_RAD = 2.02 * np.pi, 4.04 * np.pi
 
+#: m: lasers see from nearer than that, and not so far
+MAX_RANGE_MIN_M, MAX_RANGE_MAX_M = 2.0, 1000.0
+
 _NONE: Mapping[str, str] = {}
 
 
@@ -218,6 +221,8 @@ class _SensorFrames:
             findings += in_degrees(
                 topic.name, [*first, *last], "angle_increment too", MAX_SCAN_ANGLE_RAD
             )
+            limits = np.array([(m.range_min, m.range_max) for m in messages])
+            findings += odd_limits(topic.name, limits)
             no_return = find_no_return(message.ranges for message in messages)
             told["no_return_m"] = np.inf if no_return is None else no_return
         return told, findings
@@ -294,6 +299,22 @@ def in_degrees(
     text = f"its bearings are in degrees: up to {sizes.max():.0f}, where a whole turn is 6.28 rad"
     remedy = f"write them in radians: bearing * pi / 180, and {too}"
     return [Finding("unusable", "units", topic, text, remedy)]
+
+
+def odd_limits(topic: str, limits: Array) -> list[Finding]:
+    """That limits of ranges (n, 2), from and to, are none of a laser's in metres."""
+    if not len(limits):
+        return []
+    first, last = np.median(limits, axis=0).tolist()
+    remedy = "write ranges and their limits in metres"
+    if first > last:
+        text = f"ranges are from {first:g} to {last:g} m, so that none is possible"
+        remedy = "check range_min and range_max: are they exchanged?"
+    elif first > MAX_RANGE_MIN_M or (np.isfinite(last) and last > MAX_RANGE_MAX_M):
+        text = f"ranges are from {first:g} to {last:g} m: are they in mm or cm?"
+    else:
+        return []
+    return [Finding("doubt", "units", topic, text, remedy)]
 
 
 def _is_unstamped(files: Sequence[Recording], topic: Topic) -> bool:

@@ -207,6 +207,29 @@ def test_scans_in_degrees_are_refused_before_anything_is_computed(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("limits", "text"),
+    [
+        ((5.0, 3200.0), "from 5 to 3200 m: are they in mm or cm?"),
+        ((10.0, 0.1), "from 10 to 0.1 m, so that none is possible"),
+        ((0.1, np.inf), ""),
+        ((0.0, 80.0), ""),
+    ],
+)
+def test_limits_of_ranges_that_no_laser_has_are_asked_about(tmp_path, limits, text):
+    """Ranges in centimetres were dead reckoning, without a word on units."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.mount("robot", T0, (0, 0, 0))
+        for k in range(20):
+            log.odometry("robot", T0 + k * S, (k, 0, 0))
+            shape = {"angle_min_rad": -1.0, "angle_step_rad": 0.1}
+            shape |= {"range_min_m": limits[0], "range_max_m": limits[1]}
+            log.scan("robot", T0 + k * S, np.full(21, 2.0), **shape)
+    found = [line for line in open_logs([path], Config()).warnings if "ranges are from" in line]
+    assert len(found) == bool(text) and text in "".join(found)
+
+
 @pytest.mark.parametrize("first", [0.0, -np.pi, np.pi / 2, -2 * np.pi, 2 * np.pi])
 def test_beams_all_around_are_radians_wherever_they_begin(tmp_path, first):
     """0 to 6.28319 rad is a little more than a turn, as 2 π in single precision may be too."""
