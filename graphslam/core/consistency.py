@@ -200,12 +200,14 @@ def _worth_possible(agree: NDArray[Any], worth: Array | NDArray[np.float32]) -> 
     return possible
 
 
-def fit_rigid_transform(p: Array, q: Array, variance: Array) -> tuple[Array, Array]:
+def fit_rigid_transform(
+    p: Array, q: Array, variance: Array, turn_variance: float = np.inf
+) -> tuple[Array, Array]:
     """The rigid move (3,) that takes points ``q`` (n, 2) to ``p`` (n, 2), with its covariance.
 
     Weighted least squares in closed form (B. Horn, JOSA A 4, 1987, DOI 10.1364/JOSAA.4.000629, in
     the plane). The covariance (3, 3), along the axes of ``p``, is scaled up where residuals are
-    larger than ``variance`` (n,) says.
+    larger than ``variance`` (n,) says. ``turn_variance``: what is known of the turn without them.
     """
     w = 1.0 / variance
     p_mean, q_mean = (np.average(x, axis=0, weights=w) for x in (p, q))
@@ -218,6 +220,7 @@ def fit_rigid_transform(p: Array, q: Array, variance: Array) -> tuple[Array, Arr
     scale = max(1.0, misfit / max(2 * len(p) - 3, 1))
     turning = (w * (v**2).sum(axis=1)).sum()
     turned = 1.0 / turning if turning > w.sum() * COINCIDENT_M**2 else np.inf
+    turned = min(turned, turn_variance)
     lever = pose[:2] - p_mean  # the turn is about the middle of the points
     J = np.array([-lever[1], lever[0], 1.0])
     cov = np.diag([1.0 / w.sum()] * 2 + [0.0])

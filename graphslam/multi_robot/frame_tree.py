@@ -16,10 +16,11 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.consistency import has_rival, poses_differ
 from graphslam.core.frame_forest import PRIOR_INFLATION, grow_frame_forest
-from graphslam.core.geometry import compose, compose_cov
+from graphslam.core.geometry import Array, compose, compose_cov
 from graphslam.core.records import Sighting, Start
 from graphslam.core.worker import parallel_map
 from graphslam.multi_robot.relative_frames import (
+    MAX_HEADING_SIGMA_RAD,
     RelativeFrame,
     RobotEstimate,
     estimate_relative_frame,
@@ -81,6 +82,8 @@ def build_frame_tree(
     origin: Start,
     more: Sequence[RelativeFrame] = (),
     doubts: Mapping[str, str] = MappingProxyType({}),
+    *,
+    nobody_told: bool = False,
 ) -> FrameAssignment:
     """Place robots whose start is unknown relative to the others, by what they saw in common.
 
@@ -93,6 +96,8 @@ def build_frame_tree(
         origin: start of a robot in a separate frame.
         more: relations that were found in other ways.
         doubts: robot -> why those ways do not determine its start.
+        nobody_told: the world may begin where another robot does: if that of ``starts`` is but
+            seen, and its heading is not known, where it is by the one that sees it.
     """
     by_pair: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
     for s in sightings:
@@ -111,14 +116,22 @@ def build_frame_tree(
     }
 
     def relate(pair: tuple[str, str]) -> RelativeFrame | str:
-        return estimate_relative_frame(*pair, known, by_pair[pair], config)
+        # the start of one that sees nothing may be known in the other's frame alone
+        a, b = sorted(pair, key=lambda name: not known[name].sees)
+        return estimate_relative_frame(a, b, known, by_pair[pair], config)
 
     efforts = [1.0 + len(by_pair[pair]) for pair in pairs]
     for pair, relation in zip(pairs, parallel_map(relate, pairs, efforts=efforts), strict=True):
         if isinstance(relation, RelativeFrame):
-            relations += [relation, relation.reversed()]
+            relations.append(relation)
+            if not _is_turned_anyhow(relation, known):
+                relations.append(relation.reversed())
         elif relation:
             undecided |= dict.fromkeys(pair, relation)
+    if nobody_told:
+        turned = [r for r in relations if r.robot in starts and _is_turned_anyhow(r, known)]
+        if turned:
+            starts = {max(turned, key=lambda r: r.weight).other: origin}
     world = min(starts, default="")
     found: dict[str, RelativeFrame] = {}
 
@@ -137,11 +150,37 @@ def build_frame_tree(
 
     placed, frames = grow_frame_forest(robots, starts, world, origin, next_edge)
     priors = {
-        name: Start(start.pose, PRIOR_INFLATION**2 * start.cov) if name in found else start
+        name: Start(start.pose, _inflated(start.cov, _is_turned_anyhow(found[name], known)))
+        if name in found
+        else start
         for name, start in placed.items()
     }
     alone = {name: why for name, why in undecided.items() if frames[name] == name != world}
-    return FrameAssignment(priors, frames, world, found, alone)
+    remarks = {
+        name: "where it is is known by those that see it; its heading is not, as it stands and "
+        "sees nothing"
+        for name, relation in found.items()
+        if _is_turned_anyhow(relation, known)
+    }
+    return FrameAssignment(priors, frames, world, found, alone, remarks)
+
+
+def _inflated(cov: Array, is_turned_anyhow: bool) -> Array:
+    """Covariance (3, 3) of a start with larger sigmas, as its measurements enter again.
+
+    A heading of which nothing is known was not measured.
+    """
+    factors = np.array(
+        [PRIOR_INFLATION, PRIOR_INFLATION, 1.0 if is_turned_anyhow else PRIOR_INFLATION]
+    )
+    return np.asarray(factors[:, None] * cov * factors)
+
+
+def _is_turned_anyhow(relation: RelativeFrame, known: Mapping[str, RobotEstimate]) -> bool:
+    """Whether a robot that sees nothing is placed, but its heading is not known."""
+    name = relation.robot
+    is_unsure = relation.cov[2, 2] > MAX_HEADING_SIGMA_RAD**2
+    return is_unsure and name in known and not known[name].sees
 
 
 def _strongest_relation(

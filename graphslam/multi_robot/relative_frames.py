@@ -47,6 +47,8 @@ AGREE = 0.99
 MIN_EVIDENCE, LANDMARK_EVIDENCE = 4, 2
 #: rad: larger sigmas of the heading mean that a set does not determine how the frames are turned
 MAX_HEADING_SIGMA_RAD = 0.2
+#: rad²: variance of a heading of which nothing is known
+UNKNOWN_HEADING = np.pi**2 / 3
 #: sightings of one robot by another that are used at most, evenly over the log: bounds the O(n²)
 MAX_SIGHTINGS = 100
 UNTIMED = -1
@@ -57,13 +59,15 @@ class RobotEstimate:
     """Estimate of one robot from its own data, in the frame in which it begins at the origin.
 
     ``landmarks``: identity -> mean (2,), covariance (2, 2); ``anonymous_points``: means (n, 2) and
-    covariances (n, 2, 2) of points without identity.
+    covariances (n, 2, 2) of points without identity. ``sees``: whether the robot has any sensor but
+    odometry; of one that has none, and stands, the heading is of no use.
     """
 
     states: Trajectory
     track: Track
     landmarks: Mapping[str, tuple[Array, Array]]
     anonymous_points: tuple[Array, Array] = (np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    sees: bool = True
 
     def at(self, times_ns: IntArray) -> tuple[Array, Array]:
         """Poses (n, 3) and covariances (n, 3, 3): the last state before, propagated by odometry."""
@@ -82,7 +86,7 @@ class RobotEstimate:
         first_ns = self.states.stamps_ns[self.states.index_before(times_ns)]
         among = self.track.motions_among(np.union1d(first_ns, times_ns))
         return _EstimateAtTimes(
-            self.states, self.track, self.landmarks, self.anonymous_points, among=among
+            self.states, self.track, self.landmarks, self.anonymous_points, self.sees, among=among
         )
 
 
@@ -163,6 +167,9 @@ def estimate_relative_frame(
         estimates: of each robot by itself.
         sightings: of robots by robots, any of them.
         config: settings; sightings closer than `multi_robot.sampling_m` are skipped.
+
+    Where ``b`` sees nothing its heading may be unknown, as that of a robot that only stands and is
+    seen; its place is not. Then there is no start of ``a`` in the frame of ``b``.
     """
     sides, noise, weight = _correspondences(a, b, estimates, sightings, config)
     if weight.sum() < MIN_EVIDENCE:
@@ -178,14 +185,17 @@ def estimate_relative_frame(
     best = _remove_outliers(greedy_max_clique(agree, weight), p.points, q.points, variance)
     if weight[best].sum() < MIN_EVIDENCE:
         return f"too few consistent correspondences between {a} and {b}"
-    pose, cov = fit_rigid_transform(p.points[best], q.points[best], variance[best])
-    if cov[2, 2] > MAX_HEADING_SIGMA_RAD**2:
+    unknown = np.inf if estimates[b].sees else UNKNOWN_HEADING
+    pose, cov = fit_rigid_transform(p.points[best], q.points[best], variance[best], unknown)
+    if estimates[b].sees and cov[2, 2] > MAX_HEADING_SIGMA_RAD**2:
         return f"what {a} and {b} saw in common does not determine their relative heading"
     rest = np.setdiff1d(np.arange(len(weight)), best)
     rival = _remove_outliers(rival_set(agree, weight, rest), p.points, q.points, variance)
     if len(rival) > 1:
-        other, other_cov = fit_rigid_transform(p.points[rival], q.points[rival], variance[rival])
-        determined = other_cov[2, 2] < MAX_HEADING_SIGMA_RAD**2
+        other, other_cov = fit_rigid_transform(
+            p.points[rival], q.points[rival], variance[rival], unknown
+        )
+        determined = other_cov[2, 2] < MAX_HEADING_SIGMA_RAD**2 or not estimates[b].sees
         if determined and poses_differ(pose, cov, other, other_cov):
             # a correspondence may support both
             support, support_other = (

@@ -95,7 +95,10 @@ def estimate_start_poses(
     def joined(
         views: Mapping[str, RobotEstimate], meetings: Sequence[Sighting], found: Found
     ) -> FrameAssignment:
-        return build_frame_tree(log.robots, views, meetings, starts, config, own, *found)
+        told = bool(config.start.poses or config.start.from_truth or recorded.starts)
+        return build_frame_tree(
+            log.robots, views, meetings, starts, config, own, *found, nobody_told=not told
+        )
 
     if not any(topic.record in (Sighting, Scan) for topic in log.topics):
         return joined({}, (), ((), {})), {}
@@ -154,7 +157,11 @@ def separate_estimates(run: Pipeline, estimate: Estimate) -> dict[str, RobotEsti
                 np.array([cov for _, cov in unnamed[robot]]).reshape(-1, 2, 2),
             )
             states = moved.states.get(robot, unseeing)
-            views[robot] = RobotEstimate(states, own.track, marks[robot], points)
+            sees = any(
+                topic.robot == robot and topic.record in (Sighting, Scan)
+                for topic in run.log.topics
+            )
+            views[robot] = RobotEstimate(states, own.track, marks[robot], points, sees)
     return views
 
 

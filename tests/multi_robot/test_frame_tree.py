@@ -13,7 +13,7 @@ from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Trajectory
 from graphslam.evaluation.metrics import evaluate
-from graphslam.logs import IMPORTERS, open_logs, read_truth
+from graphslam.logs import IMPORTERS, LogWriter, open_logs, read_truth
 from graphslam.results.folder import load, save
 from graphslam.slam.smooth import smooth
 from graphslam.slam.start_priors import first_truth
@@ -100,6 +100,38 @@ def test_every_back_end_starts_where_robots_were_found(tmp_path, backend):
     """The EKF has only the causal half of it: twice the error."""
     result = run(tmp_path, f"backend.name={backend}")
     assert max(misfit(result, robot) for robot in STARTS) < 0.3
+
+
+@pytest.mark.parametrize("names", ["ab", "ba"])
+def test_a_robot_that_stands_and_sees_nothing_is_a_landmark_for_the_others(tmp_path, names):
+    """Nothing tells its heading, and all that was seen of it was left out: dead reckoning, 0.7 m
+    off. As a landmark of unknown place it makes the path right, whichever comes first by name."""
+    mover, parked = names
+    rng = np.random.default_rng(3)
+    place, path = np.array([7.0, 0.0]), tmp_path / "log.mcap"
+    t = np.arange(0, 60, 0.1)
+    angle = 2 * np.pi * t / 30
+    true = np.column_stack([3 * np.sin(angle), 3 - 3 * np.cos(angle), angle])
+    with LogWriter(path) as log:
+        odometry = np.zeros(3)
+        for k, stamp in enumerate((T0 + np.rint(t * S).astype(np.int64)).tolist()):
+            if k:
+                moved = between(true[k - 1], true[k]) * [1.02, 1.0, 1.04]
+                odometry = compose(odometry, moved + rng.normal(0, 1e-3, 3))
+            log.odometry(mover, stamp, odometry)
+            log.odometry(parked, stamp, (0, 0, 0))
+            off = place - true[k, :2]
+            z = np.array([wrap(np.arctan2(*off[::-1]) - true[k, 2]), np.hypot(*off)])
+            z += rng.normal(0, [0.02, 0.05])
+            log.sighting(mover, stamp, z, np.diag([0.02**2, 0.05**2]), seen_robot=parked)
+    result = smooth(open_logs([path], load_config()), load_config())
+    assert len(set(result.summary["frames"].values())) == 1
+    final = result.robots[mover].final
+    own = true[np.searchsorted(T0 + np.rint(t * S).astype(np.int64), final.stamps_ns)]
+    off = between(final.poses[0], final.poses)[:, :2] - between(own[0], own)[:, :2]
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.1
+    assert any("its heading is not" in line for line in result.summary["warnings"])
+    assert np.sqrt(result.robots[parked].final.covs[-1, 2, 2]) > 1.0
 
 
 @pytest.mark.parametrize("marks", [{}, {"6": LANDMARKS["6"]}])
