@@ -45,10 +45,8 @@ def regular_landmark_doubts(evidence: Evidence) -> Iterator[Reason]:
 def _confusable(robot: RobotEvidence) -> tuple[float, float] | None:
     """Distance after which landmarks repeat, and by how much odometry is off, m; None: no doubt."""
     seen = robot.seen
-    nameless = np.array([not name for name in seen.names], dtype=bool)
-    if not len(nameless) or not len(seen.targets):
-        return None
-    use = np.flatnonzero(seen.stands & nameless[seen.targets])
+    named = [number for number, name in enumerate(seen.names) if name]
+    use = np.flatnonzero(seen.stands & ~np.isin(seen.targets, named))
     if not len(use):
         return None
     apart = repetition(_places(seen, use))

@@ -154,7 +154,7 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
     size = np.hypot(moved[:, 0], moved[:, 1])
     moves = (size > MOVED_M) | (np.abs(moved[:, 2]) > MOVED_RAD)
     a, b, moved, noise = a[moves], b[moves], moved[moves], noise[moves]
-    if len(a) < LEAST:
+    if len(a) < LEAST or _is_half_measured(seen.z[a]):
         return
     found: dict[str, list[int]] = {}
     parts = np.arange(len(a)) * PARTS // len(a) if len(a) >= PARTS * LEAST else 0 * a
@@ -162,15 +162,14 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
         own = parts == part
         z1, z2, motion = seen.z[a[own]], seen.z[b[own]], moved[own]
         plain = float(_disagreement(z1, z2, motion))
-        uncertain = float(np.median(noise[own]))
-        if plain < max(TOLERANCE, uncertain):  # what was not measured may be anything
+        if plain < TOLERANCE:
             continue
         some = slice(None, None, 1 + len(z1) // MOST)
         tried = _explained(z1[some], z2[some], motion[some])
         best = min(tried, key=lambda text: tried[text])
         what = best
         if tried[best] > BETTER * plain:
-            if plain < 3 * uncertain:
+            if plain < 3 * float(np.median(noise[own])):
                 continue  # it is noise
             what = CONTRADICTION
         found.setdefault(what, []).append(int(seen.times_ns[a[own]][0]))
@@ -178,6 +177,14 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
         since = seconds(times[0], int(robot.readings_ns[0]))
         certain = what != CONTRADICTION and len(times) > 1
         yield _reason(robot, "bad" if certain else "doubtful", f"{what}, from {since} on")
+
+
+def _is_half_measured(z: Array) -> bool:
+    """Whether of bearings and ranges (n, 2) one never changes: a constant stands for it.
+
+    Where both never change an image may be repeated.
+    """
+    return bool((np.ptp(z, axis=0) == 0).sum() == 1)
 
 
 def _outliers(robot: RobotEvidence) -> Iterator[Reason]:
