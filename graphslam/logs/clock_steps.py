@@ -20,12 +20,13 @@ _NO_END = np.iinfo(np.int64).max
 #: topic -> first and last time, ns, that its messages in a recording may have
 Spans = Mapping[str, tuple[int, int]]
 
-#: ns: stamps of one recording are not farther from the next than that, a week
-LONGEST_PAUSE_NS = 7 * 86_400_000_000_000
+#: ns: stamps of one recording are not farther from the next than that, thirty days. Blocks of one
+#: that lasts for less than four times as long are never farther apart
+LONGEST_PAUSE_NS = 30 * 86_400_000_000_000
 #: blocks of a recording that are looked at, and messages of a topic in each
 BLOCKS, PER_BLOCK = 4, 4
 #: what such messages are counted as
-OTHER_CLOCK = "stamped more than a week from most others: the clock was set"
+OTHER_CLOCK = "stamped more than a month from most others: the clock was set"
 
 
 def spans_of_stamps(
