@@ -284,7 +284,7 @@ class Indexer:
         names = {number: schema.name for number, schema in self.schemas.items()}
         names[_NO_SCHEMA] = ""
         return {
-            number: TopicChannel(c.topic, names[c.schema_id], c.message_encoding)
+            number: TopicChannel.of(c.topic, names[c.schema_id], c.message_encoding)
             for number, c in self.channels.items()
             if c.schema_id in names
         }

@@ -99,7 +99,7 @@ def _is_message(topic: object, log_time_ns: object, data: object) -> bool:
 def _indexed(path: Path, database: sqlite3.Connection) -> Piece:
     try:
         topics = database.execute("SELECT id, name, type, serialization_format FROM topics")
-        channels = {number: Channel(*map(str, kind)) for number, *kind in topics}
+        channels = {number: Channel.of(*map(str, kind)) for number, *kind in topics}
     except sqlite3.DatabaseError as error:
         raise LogError(
             f"{path}: is not an SQLite file of rosbag2, or its list of topics is damaged "

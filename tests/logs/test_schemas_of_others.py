@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from mcap.writer import Writer
 from room_log import MOUNT, START_NS, drive
 
@@ -287,6 +288,26 @@ def test_what_is_written_is_what_the_reference_reads(frame):
     assert [tuple(t) for t in transforms_of(tf_bytes(transforms))] == transforms
     for transform in message.transforms:
         assert (transform.transform.translation.z, transform.transform.rotation.w) == (2, 6)
+
+
+def test_names_of_types_without_msg_are_those_of_early_recordings(tmp_path, log):
+    """`sensor_msgs/LaserScan` for `sensor_msgs/msg/LaserScan`."""
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as target, log.open("rb") as source:
+        writer = Writer(target)
+        writer.start()
+        channels: dict[str, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages(log_time_order=False):
+            if channel.topic not in channels:
+                name = schema.name.replace("/msg/", "/")
+                number = writer.register_schema(name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            times = message.log_time, message.publish_time
+            writer.add_message(channels[channel.topic], times[0], message.data, times[1])
+        writer.finish()
+    early, usual = (open_logs([p], Config()) for p in (path, log))
+    assert early.topics and early.topics == usual.topics
+    assert len(list(early.messages())) == len(list(usual.messages()))
 
 
 @pytest.mark.parametrize("frame", [b"", b"laser"])
