@@ -317,7 +317,7 @@ def test_relations_that_contradict_place_no_robot():
     start = Start(np.zeros(3), np.diag([0.01, 0.01, 0.01]) ** 2)
     cov = np.diag([0.05, 0.05, 0.01]) ** 2
     relations = [RelativeFrame("b", "a", pose, cov, 5.0) for pose in (TURNED, -TURNED)]
-    nothing = SimpleNamespace(landmarks={})
+    nothing = SimpleNamespace(landmarks={}, sees=True)
     joined = build_frame_tree(
         ("a", "b"), {"a": nothing, "b": nothing}, (), {"a": start}, Config(), start,
         relations,
