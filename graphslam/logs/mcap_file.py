@@ -51,6 +51,7 @@ from graphslam.logs.recording import (
     undescribed,
 )
 from graphslam.logs.recording import Channel as TopicChannel
+from graphslam.logs.schemas import full_name
 
 MAGIC = b"\x89MCAP0\r\n"
 NOTES = "graphslam"  # name of the metadata record in which our own logs carry notes
@@ -284,7 +285,9 @@ class Indexer:
         names = {number: schema.name for number, schema in self.schemas.items()}
         names[_NO_SCHEMA] = ""
         return {
-            number: TopicChannel.of(c.topic, names[c.schema_id], c.message_encoding)
+            number: TopicChannel(
+                c.topic, full_name(names[c.schema_id], c.message_encoding), c.message_encoding
+            )
             for number, c in self.channels.items()
             if c.schema_id in names
         }

@@ -58,14 +58,6 @@ class Channel(NamedTuple):
     schema: str
     encoding: str
 
-    @classmethod
-    def of(cls, topic: str, schema: str, encoding: str) -> "Channel":
-        """The same with the schema by its full name, which early ROS 2 recordings do not have."""
-        package, slash, kind = schema.partition("/")
-        if encoding == "cdr" and slash and "/" not in kind:
-            schema = f"{package}/msg/{kind}"
-        return cls(topic, schema, encoding)
-
 
 @dataclass(frozen=True, slots=True)
 class Block:

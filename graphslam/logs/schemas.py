@@ -196,6 +196,13 @@ _DECODER = Decoder(_ROS_DEFINITIONS | DEFINITIONS)
 KNOWN = frozenset(name for name in (*_ROS_DEFINITIONS, *DEFINITIONS) if "/msg/" in name)
 
 
+def full_name(name: str, encoding: str) -> str:
+    """The name of a type with its ``msg``, which early ROS 2 recordings leave out."""
+    package, slash, kind = name.partition("/")
+    is_short = encoding == "cdr" and slash and "/" not in kind
+    return f"{package}/msg/{kind}" if is_short else name
+
+
 @cache
 def _typestore() -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415

@@ -25,6 +25,7 @@ from graphslam.logs.recording import (
     one_line,
     undescribed,
 )
+from graphslam.logs.schemas import full_name
 
 MAGIC = b"SQLite format 3\0"
 
@@ -99,7 +100,10 @@ def _is_message(topic: object, log_time_ns: object, data: object) -> bool:
 def _indexed(path: Path, database: sqlite3.Connection) -> Piece:
     try:
         topics = database.execute("SELECT id, name, type, serialization_format FROM topics")
-        channels = {number: Channel.of(*map(str, kind)) for number, *kind in topics}
+        channels = {
+            number: Channel(str(name), full_name(str(kind), str(encoding)), str(encoding))
+            for number, name, kind, encoding in topics
+        }
     except sqlite3.DatabaseError as error:
         raise LogError(
             f"{path}: is not an SQLite file of rosbag2, or its list of topics is damaged "
