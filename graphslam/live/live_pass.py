@@ -248,6 +248,7 @@ class LivePass(Pipeline):
         self._placed = 0
         before_ns = self.last_ns - self._memory_ns
         for robot, run in self.started.items():
+            # from the last state on: while a robot stands its latest scan stays its first one
             self.landmarks.expire(run.state_ns, robot, math.inf, self._memory_ns, 0.0)
             first = min(before_ns, run.state_ns)
             run.track.forget_before(first)

@@ -96,8 +96,8 @@ def build_frame_tree(
         origin: start of a robot in a separate frame.
         more: relations that were found in other ways.
         doubts: robot -> why those ways do not determine its start.
-        nobody_told: the world may begin where another robot does: if that of ``starts`` is but
-            seen, and its heading is not known, where it is by the one that sees it.
+        nobody_told: ``starts`` is one robot at the origin because none was given. If it only stands
+            and is seen, the world begins at the robot that sees it most instead.
     """
     by_pair: dict[tuple[str, str], list[Sighting]] = defaultdict(list)
     for s in sightings:
@@ -177,7 +177,7 @@ def _inflated(cov: Array, is_turned_anyhow: bool) -> Array:
 
 
 def _is_turned_anyhow(relation: RelativeFrame, known: Mapping[str, RobotEstimate]) -> bool:
-    """Whether a robot that sees nothing is placed, but its heading is not known."""
+    """Whether a relation places a robot that sees nothing, but leaves its heading open."""
     name = relation.robot
     is_unsure = relation.cov[2, 2] > MAX_HEADING_SIGMA_RAD**2
     return is_unsure and name in known and not known[name].sees

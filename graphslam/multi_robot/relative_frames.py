@@ -59,8 +59,8 @@ class RobotEstimate:
     """Estimate of one robot from its own data, in the frame in which it begins at the origin.
 
     ``landmarks``: identity -> mean (2,), covariance (2, 2); ``anonymous_points``: means (n, 2) and
-    covariances (n, 2, 2) of points without identity. ``sees``: whether the robot has any sensor but
-    odometry; of one that has none, and stands, the heading is of no use.
+    covariances (n, 2, 2) of points without identity. ``sees``: whether the robot has scans or
+    sightings; of one that has neither, and stands, nothing can tell the heading.
     """
 
     states: Trajectory

@@ -14,7 +14,7 @@ from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.doubts import Reason
 from graphslam.slam.evidence import Evidence, RobotEvidence, Seen
 
-#: landmarks without which nothing repeats; the latest seen are looked at, at most so many
+#: landmarks without which nothing repeats; those mapped last are looked at, at most so many
 FEWEST, MOST = 9, 500
 #: share of the landmarks that are others' neighbours, all moved alike, where they are regular: of
 #: those that stand at random it is 0.1
@@ -23,9 +23,9 @@ REGULAR = 0.6
 NEAR = 0.2
 #: s: a landmark that was not seen for so long is seen again
 AGAIN_S = 10.0
-#: of the distance between neighbours: how far off calibrated odometry may be when one is
-#: seen again
-HALF = 0.5
+#: of the distance between neighbours: how far off calibrated odometry may be when one is seen
+#: again; from half on the next one is as near
+CONFUSABLE = 0.5
 
 
 def regular_landmark_doubts(evidence: Evidence) -> Iterator[Reason]:
@@ -53,7 +53,7 @@ def _confusable(robot: RobotEvidence) -> tuple[float, float] | None:
     if apart is None:
         return None
     off = _off_when_seen_again(seen, use)
-    return (apart, off) if off > HALF * apart else None
+    return (apart, off) if off > CONFUSABLE * apart else None
 
 
 def _places(seen: Seen, use: IntArray) -> Array:
@@ -69,7 +69,7 @@ def _places(seen: Seen, use: IntArray) -> Array:
 def repetition(points: Array) -> float | None:
     """The distance by which points (n, 2) can be moved onto each other; None if they cannot.
 
-    Tried are the steps from each point to the nearest one: n² distances for each of some.
+    The step that is tried is the most usual one from a point to the nearest other; O(n²).
     """
     if len(points) < FEWEST:
         return None

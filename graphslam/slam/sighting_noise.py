@@ -195,9 +195,9 @@ def _sighting_noise(
 def _is_measured(posterior: Posterior, source: Source) -> Array:
     """Whether the bearings and the ranges (2,) of a source are stated to be measured at all.
 
-    A sigma as large as the ranges themselves, or of a radian, says that what stands there is not:
-    a camera that sees bearings alone writes some constant. It may repeat itself, but that it hardly
-    differs from what is estimated is no measurement of anything.
+    A sigma as large as the ranges themselves, or of a radian, says that they are not: a camera that
+    sees bearings alone writes some constant as range. Its residuals are far below such a sigma, as
+    the constant has about the right size, and tell nothing of a measurement.
     """
     seen = [a for *_, a in posterior.builder.bearings_and_ranges[source]]
     sigmas = np.sqrt([np.diag(a.cov) for a in seen])
