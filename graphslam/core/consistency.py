@@ -207,8 +207,8 @@ def fit_rigid_transform(
 
     Weighted least squares in closed form (B. Horn, JOSA A 4, 1987, DOI 10.1364/JOSAA.4.000629, in
     the plane). The covariance (3, 3), along the axes of ``p``, is scaled up where residuals are
-    larger than ``variance`` (n,) says. ``turn_variance``, rad²: that of the turn without the points,
-    which it does not exceed.
+    larger than ``variance`` (n,) says. ``turn_variance``, rad²: that of the turn without the
+    points, which it does not exceed.
     """
     w = 1.0 / variance
     p_mean, q_mean = (np.average(x, axis=0, weights=w) for x in (p, q))
