@@ -2,13 +2,16 @@
 
 Only calls go over the network: logs are read where they lie, in a folder that all see. A lost
 worker's tasks are given to others by the scheduler; a task whose worker dies again and again (the
-scheduler's setting ``allowed-failures``) is given up. See docs/clusters.md.
+scheduler's setting ``allowed-failures``) is given up. The scheduler counts this against all that a
+worker had in hand, also those that only waited behind the one that killed it: when several are
+given up, they are tried once more with none behind another. See docs/clusters.md.
 """
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
+from contextlib import closing
 from typing import Any
 from uuid import uuid4
 
@@ -41,14 +44,42 @@ def run_on_cluster(
     # it warns of lost workers, whose tasks are done again
     logging.getLogger("distributed").setLevel(logging.ERROR)
     client = _connect(workers.scheduler)
-    futures: dict[Any, Task] = {}
     try:
         announce(_checked(client, workers))
+        given_up: list[Outcome] = []
+        with closing(_ended(client, tasks, workers.memory_mb)) as ended:
+            for outcome in ended:
+                if isinstance(outcome.error, WorkerLostError):
+                    given_up.append(outcome)
+                else:
+                    yield outcome
+        if len(given_up) < 2:  # nobody else can have killed its workers
+            yield from given_up
+            return
+        while given_up:
+            at_once = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+            again = [outcome.task for outcome in given_up[:at_once]]
+            del given_up[:at_once]
+            yield from _ended(client, again, workers.memory_mb)
+    except (CancelledError, distributed.comm.CommClosedError) as error:
+        raise OutputError(
+            f"{workers.scheduler}: the scheduler is gone; what is done is kept, run it again"
+        ) from error
+    finally:
+        client.close()
+
+
+def _ended(client: Any, tasks: Sequence[Task], memory_mb: float | None) -> Generator[Outcome]:
+    """Outcomes as they end; what has not ended when the caller stops is cancelled."""
+    import distributed  # noqa: PLC0415 -- of an extra, and takes long
+
+    futures: dict[Any, Task] = {}
+    try:
         # the key is what the dashboard shows; its last part makes it unlike that of an earlier run
         run = uuid4().hex[:8]
         for task in tasks:
             key = f"{task.function.__name__}-{task.label}-{run}"
-            asked = (task, workers.memory_mb, code_version())
+            asked = (task, memory_mb, code_version())
             futures[client.submit(execute_on_worker, *asked, key=key, pure=False)] = task
         # values are fetched as soon as they are there: those that a worker still holds die with it
         ended = distributed.as_completed(
@@ -58,14 +89,9 @@ def run_on_cluster(
             task = futures.pop(future)
             yield _outcome(task, future, value, distributed.KilledWorker)
             future.release()
-    except (CancelledError, distributed.comm.CommClosedError) as error:
-        raise OutputError(
-            f"{workers.scheduler}: the scheduler is gone; what is done is kept, run it again"
-        ) from error
     finally:
         if futures and client.status == "running":
             client.cancel(list(futures), force=True)
-        client.close()
 
 
 def execute_on_worker(task: Task, memory_mb: float | None, code: str) -> Any:

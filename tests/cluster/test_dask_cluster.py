@@ -148,6 +148,20 @@ def test_who_takes_too_much_memory_is_named_and_the_rest_goes_on(three, tmp_path
     assert str(found["deadly.mcap"].error).startswith("deadly.mcap: every worker that had it died")
 
 
+def test_who_waits_behind_a_task_that_kills_its_worker_is_not_given_up(tmp_path):
+    """The scheduler counts deaths of a worker against all that it had in hand."""
+    tasks = [
+        Task("deadly.mcap", do.die, (tmp_path, "deadly", 99)),
+        *(Task(f"small {k}", do.square, (tmp_path, k)) for k in range(3)),
+    ]
+    with cluster(tmp_path, 1, "--memory-limit", "1GB") as one:
+        found = {o.task.label: o for o in run_tasks(tasks, Workers(scheduler=one.address))}
+    assert isinstance(found.pop("deadly.mcap").error, WorkerLostError)
+    assert {label: (o.value, o.error) for label, o in found.items()} == {
+        f"small {k}": (k * k, None) for k in range(3)
+    }
+
+
 def test_workers_have_one_thread_in_linear_algebra(three, tmp_path):
     (found,) = run_tasks(
         [Task("a", do.environment, (tmp_path,))], Workers(scheduler=str(three.file))
