@@ -74,6 +74,9 @@ class _Closer:
         self.at: dict[State, int] = {s.state: k for k, s in enumerate(submaps)}
         self.robots = np.unique([s.state[0] for s in submaps], return_inverse=True)[1]
         self.path_m = np.array([s.path_m for s in submaps])
+        # robots take turns by time, so that none is far ahead of the others
+        self.order = np.argsort([s.state[1] for s in submaps], kind="stable")
+        self.rank = np.argsort(self.order)  # place in this order
         self.accepted: dict[Pair, Closure] = {}
         self.correcting: set[Pair] = set()
         self.refused: set[Pair] = set()
@@ -90,10 +93,12 @@ class _Closer:
         limit = np.array([config.search_max_m, config.search_max_m, config.search_max_rad])
         pairs: list[tuple[int, int]] = []
         for i in later.tolist():
-            distance = np.hypot(*(poses[:i, :2] - poses[i, :2]).T)
-            apart = self.robots[:i] != self.robots[i]
-            apart |= self.path_m[i] - self.path_m[:i] >= config.revisit_path_m
-            j = np.flatnonzero(apart & (distance <= NEAR_M + limit[0]))
+            distance = np.hypot(*(poses[:, :2] - poses[i, :2]).T)
+            apart = self.robots != self.robots[i]
+            apart |= self.path_m[i] - self.path_m >= config.revisit_path_m
+            # the graph has no poses of later ones yet, whatever their place among the submaps
+            earlier = self.rank < self.rank[i]
+            j = np.flatnonzero(earlier & apart & (distance <= NEAR_M + limit[0]))
             ends = np.flatnonzero((np.diff(j) > 1) | (np.diff(self.robots[j]) != 0)) + 1
             nearest = [s[distance[s].argmin()] for s in np.split(j, ends) if len(s)]
             nearest.sort(key=lambda k: (distance[k] // SAME_M, k))
@@ -193,8 +198,7 @@ def close_loops(
         tamper: for tests, see `Tamper`.
     """
     closer = _Closer(submaps, nodes, graph, config)
-    # robots take turns by time, so that none is far ahead of the others
-    order = np.argsort([s.state[1] for s in submaps], kind="stable")
+    order = closer.order
     with PairVerifier(submaps, along=True) as verify:
         ends = [*range(AT_ONCE, len(order) + AT_ONCE, AT_ONCE), len(order)]
         for n, end in enumerate(ends):

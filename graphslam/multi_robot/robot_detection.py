@@ -201,10 +201,11 @@ def _sighting(scan: Scan, name: str, fit: OutlineFit) -> Sighting:
 
 def without_returns(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
     """The scan without returns of rows ``gone`` (k,) of its sweep."""
-    angles = sweep.angles[sweep.beam[gone]]
-    beams = np.rint((angles - scan.angle_min_rad) / scan.angle_step_rad).astype(np.int64)
+    # a sweep has the beams in another order; those of a deskewed scan are not equally spaced
+    angles, order = sweep.angles[sweep.beam[gone]], np.argsort(scan.angles)
+    beams = order[np.searchsorted(scan.angles, angles, sorter=order)]
     ranges = scan.ranges.copy()
-    ranges[beams % len(ranges)] = np.nan
+    ranges[beams] = np.nan
     return replace(scan, ranges=ranges)
 
 

@@ -25,8 +25,8 @@ from graphslam.slam.vanished_points import vanished_doubts
 
 #: factors on a stated variance that a log shows: from the first one doubtful, from the other bad
 NOISE_FACTORS = 30.0, 1000.0
-#: squared residuals per degree of freedom without kernels: of healthy logs up to 2
-MISFITS = 8.0, 100.0
+#: squared residuals per degree of freedom without kernels: of healthy logs up to 4
+MISFITS = 16.0, 200.0
 #: squared distance of a closure, three degrees of freedom: of healthy logs up to 6
 CONTRADICTED_CLOSURE = 50.0
 #: pairs of places that are not joined though they look the same, and their share of all such pairs
@@ -115,10 +115,11 @@ def _misfit(evidence: Evidence) -> Iterable[Reason]:
     graph = evidence.summary["graph"]
     if not graph["dof"]:  # back ends that use no observations
         return
-    misfit = graph["error_without_kernels"] / graph["dof"]
+    misfit = 2 * graph["error_without_kernels"] / graph["dof"]  # it is half the squared residuals
     level = _level(misfit, MISFITS)
     if level:
-        text = f"observations contradict each other: residuals are {misfit:.3g} times their noise"
+        times = misfit**0.5
+        text = f"observations contradict each other: residuals are {times:.3g} times their noise"
         yield Reason(level, "residuals", "", text)
 
 

@@ -10,7 +10,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Scan
 from graphslam.logs import open_logs
-from graphslam.multi_robot.robot_detection import ExpectedPose, detect_robots
+from graphslam.multi_robot.robot_detection import ExpectedPose, detect_robots, without_returns
 from graphslam.perception.dynamic_objects import dynamic_returns
 from graphslam.perception.ordered_scan import make_sweep
 from graphslam.perception.robot_outlines import outline_of
@@ -128,6 +128,19 @@ def test_the_returns_of_a_robot_are_removed_and_no_others(name):
         away = np.hypot(*(np.array(x) - between(scan.mount, truth)[:2, None]))
         assert gone[away < 0.4].all()
         assert not gone[away > 1.0].any()
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_beams_of_a_deskewed_scan_are_removed_by_their_number(step):
+    """Its beams are not equally spaced: those of a number by the mean step are others."""
+    even = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    bearings = (even + 0.05 * np.sin(3 * even))[::step]
+    scan = Scan("a", 0, 0, np.full(360, 5.0), bearings[0], step * np.deg2rad(1.0),
+                np.zeros(3), bearings=bearings)  # fmt: skip
+    scan.ranges[100:130] = 2.0
+    sweep = make_sweep(scan, 30.0)
+    left = without_returns(scan, sweep, np.hypot(*sweep.points.T) < 3.0)
+    assert np.flatnonzero(np.isnan(left.ranges)).tolist() == list(range(100, 130))
 
 
 def test_no_robot_is_found_where_there_is_none():

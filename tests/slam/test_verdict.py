@@ -453,7 +453,7 @@ def test_what_is_wrong_is_said_as_what_it_is(name):
     ("change", "level", "text"),
     [
         ({"noise": {"tom point": {"measured": {"bearings": 5e3}}}}, "bad", "bearings are 71"),
-        ({"graph": {"error_without_kernels": 2e3, "dof": 100}}, "doubtful", "20 times their noise"),
+        ({"graph": {"error_without_kernels": 2e3, "dof": 100}}, "doubtful", "6.32 times"),
         ({"rejected": {"why": 4000}}, "doubtful", "4000 of 4500 observations"),
         ({"logs": [{"path": "x", "lost": 9, "messages": 91}]}, "doubtful", "9 of 100 messages"),
         ({"logs": [{"path": "x", "lost": None, "messages": 91}]}, "doubtful", "nobody knows"),
