@@ -12,8 +12,11 @@ from graphslam.mapping.submaps import SubmapPose
 PER_LAP, STEP_M = 20, 2.0
 
 
-def laps(count):
-    """Submaps once every 2 m of rounds on one circle, each round a little beside the others."""
+def laps(count, first_day=0):
+    """Submaps once every 2 m of rounds on one circle, each round a little beside the others.
+
+    ``first_day``: rounds that were driven after all others, as another robot.
+    """
     n = count * PER_LAP
     angle = 2 * np.pi * np.arange(n) / PER_LAP
     radius = STEP_M * PER_LAP / (2 * np.pi)
@@ -24,7 +27,12 @@ def laps(count):
     cov = np.diag([0.1, 0.1, 0.05]) ** 2
     chain = SubmapConstraints(begin, begin + 1, delta, np.tile(cov, (n - 1, 1, 1)))
     graph = SubmapGraph(poses, chain, [0], symmetric(1e-8 * np.eye(3))[None])
-    submaps = [SubmapPose(("r", k), pose, STEP_M * k, (k, k), None) for k, pose in enumerate(poses)]
+    late = first_day * PER_LAP
+    states = [("a", k + n) if k < late else ("r", k) for k in range(n)]
+    submaps = [
+        SubmapPose(state, pose, STEP_M * k, (state[1],) * 2, None)
+        for k, (state, pose) in enumerate(zip(states, poses, strict=True))
+    ]
     return _Closer(submaps, np.arange(n), graph, LoopClosureConfig())
 
 
@@ -41,3 +49,15 @@ def test_a_place_is_compared_with_its_first_visits(monkeypatch):
     for later, earlier in pairs:
         # neighbours of the place itself may be of the visit before or after it
         assert earlier.state[1] < (MAX_VISITS + 0.5) * PER_LAP < later.state[1]
+
+
+def test_a_place_is_compared_with_what_was_driven_before_it(monkeypatch):
+    """Sessions come in the order of their names: what comes first may have been driven last, and
+    the graph does not have it yet when the others are closed."""
+    monkeypatch.setattr(
+        sequential_closing, "SubmapPair", lambda later, earlier, *_: (later, earlier)
+    )
+    closer = laps(4, first_day=2)
+    pairs = closer.candidates(np.arange(4 * PER_LAP))
+    assert {(a.state[0], b.state[0]) for a, b in pairs} == {("a", "r"), ("a", "a"), ("r", "r")}
+    assert all(b.state[1] < a.state[1] for a, b in pairs)
