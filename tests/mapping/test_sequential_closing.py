@@ -12,10 +12,10 @@ from graphslam.mapping.submaps import SubmapPose
 PER_LAP, STEP_M = 20, 2.0
 
 
-def laps(count, first_day=0):
+def laps(count, driven_last=0):
     """Submaps once every 2 m of rounds on one circle, each round a little beside the others.
 
-    ``first_day``: rounds that were driven after all others, as another robot.
+    ``driven_last``: so many of the first rounds are another robot's, after all others.
     """
     n = count * PER_LAP
     angle = 2 * np.pi * np.arange(n) / PER_LAP
@@ -27,7 +27,7 @@ def laps(count, first_day=0):
     cov = np.diag([0.1, 0.1, 0.05]) ** 2
     chain = SubmapConstraints(begin, begin + 1, delta, np.tile(cov, (n - 1, 1, 1)))
     graph = SubmapGraph(poses, chain, [0], symmetric(1e-8 * np.eye(3))[None])
-    late = first_day * PER_LAP
+    late = driven_last * PER_LAP
     states = [("a", k + n) if k < late else ("r", k) for k in range(n)]
     submaps = [
         SubmapPose(state, pose, STEP_M * k, (state[1],) * 2, None)
@@ -57,7 +57,7 @@ def test_a_place_is_compared_with_what_was_driven_before_it(monkeypatch):
     monkeypatch.setattr(
         sequential_closing, "SubmapPair", lambda later, earlier, *_: (later, earlier)
     )
-    closer = laps(4, first_day=2)
+    closer = laps(4, driven_last=2)
     pairs = closer.candidates(np.arange(4 * PER_LAP))
     assert {(a.state[0], b.state[0]) for a, b in pairs} == {("a", "r"), ("a", "a"), ("r", "r")}
     assert all(b.state[1] < a.state[1] for a, b in pairs)

@@ -131,8 +131,8 @@ def test_the_returns_of_a_robot_are_removed_and_no_others(name):
 
 
 @pytest.mark.parametrize("step", [1, -1])
-def test_beams_of_a_deskewed_scan_are_removed_by_their_number(step):
-    """Its beams are not equally spaced: those of a number by the mean step are others."""
+def test_the_right_beams_of_a_deskewed_scan_are_removed(step):
+    """Its bearings are not equally spaced: beam numbers from the nominal step would be others."""
     even = np.linspace(-np.pi, np.pi, 360, endpoint=False)
     bearings = (even + 0.05 * np.sin(3 * even))[::step]
     scan = Scan("a", 0, 0, np.full(360, 5.0), bearings[0], step * np.deg2rad(1.0),
