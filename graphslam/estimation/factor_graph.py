@@ -103,7 +103,7 @@ class GraphBuilder:
         self.oldest: dict[str, int] = defaultdict(int)
         self.kept: set[int] = set()
         self.skipped: Counter[str] = Counter()
-        self._late, self._wide, self._make_lines = late, wide, lines
+        self._late, self._wide, self.makes_lines = late, wide, lines
         self._first_seen: dict[int, Association] = {}  # landmark -> its first observation
 
     def state_key(self, robot: str, number: int) -> int:
@@ -192,7 +192,7 @@ class GraphBuilder:
             observed = self.states.number(seen.target, time_ns)
             target, known = self.state_key(seen.target, observed), True
         self.rows += model.rows
-        if known and seen.model == "line" and not self._make_lines:
+        if known and seen.model == "line" and not self.makes_lines:
             return FactorGroup((), "", observed=(key, target, seen))  # its factor is made later
         # only new landmarks and lines need an estimate, which is expensive
         x = t = _UNUSED
@@ -210,7 +210,7 @@ class GraphBuilder:
             if new is not None and seen.model == "line":
                 made.append(factors.line_gauge_factor(key, target, seen, wide=self._wide))
                 self.rows += 1
-            if self._make_lines or seen.model != "line":
+            if self.makes_lines or seen.model != "line":
                 made.append(factors.observation_factor(key, target, seen, self.kernel, x, t))
         except (EstimationError, np.linalg.LinAlgError) as error:
             raise EstimationError(f"{describe(seen)}: {error}") from error

@@ -18,20 +18,25 @@ Source: G. Huang, A. Mourikis, S. Roumeliotis, Observability-based rules for des
 EKF SLAM estimators, IJRR 2010, https://doi.org/10.1177/0278364909353640.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.geometry import Array, rotate_cov
 from graphslam.core.known_landmarks import KnownLandmarks
-from graphslam.core.records import Estimate, Step
+from graphslam.core.records import Association, Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.dormant_variables import DormantVariables, covariance
-from graphslam.estimation.factor_graph import GraphBackend, GraphBuilder
+from graphslam.estimation.factor_graph import FactorGroup, GraphBackend, GraphBuilder
 from graphslam.estimation.square_root import Rows, eliminate, stacked
 from graphslam.estimation.window import IndeterminateWindowError, Window, WindowFactor
+
+#: steps after which states leave in `FixedLagBackend.restart`
+REPLAYED_AT_ONCE = 10
+NO_CORRECTIONS: Mapping[int, Array] = MappingProxyType({})
 
 
 class FixedLagBackend(GraphBackend):
@@ -46,15 +51,19 @@ class FixedLagBackend(GraphBackend):
     most_states: int | None = None
 
     def __init__(self, config: Config) -> None:
-        # weights are of residuals at the current estimate, so the window applies the kernel
-        super().__init__(GraphBuilder(RobustConfig(kernel="none"), wide=False))
+        super().__init__(_builder())
         self._horizon_ns = round(1e9 * config.backend.horizon_s)
-        self._window = Window(config.robust)
+        self._kernel = config.robust
+        self._kept: dict[tuple[str, int], int] = {}  # robot and time -> a state that stays
+        self._begin()
+
+    def _begin(self) -> None:
+        """Without any step."""
+        self._window = Window(self._kernel)
         self._dormant = DormantVariables()
         self._points: dict[int, Array] = {}  # linearisation points of dormant landmarks
         self._z: dict[int, Array] | None = None  # their corrections, if computed since the step
         self._past: dict[int, tuple[Array, Array]] = {}  # states that left
-        self._kept: dict[tuple[str, int], int] = {}  # robot and time -> a state that stays
 
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
@@ -86,30 +95,101 @@ class FixedLagBackend(GraphBackend):
     def add(self, step: Step) -> None:
         """See `Backend`."""
         self._joints.clear()
-        seen = {
-            factors.landmark_key(a.target) for a in step.associations if isinstance(a.target, int)
-        }
-        ends = {end for closure in step.closures for end in closure.pair}
-        seen |= {self._kept[end] for end in ends & self._kept.keys()}
+        seen = self._seen_in(step)
         if step.known is not None:
             self._take_known(step.known)
             step = replace(step, known=None)
-        self._wake([key for key in seen if key in self._dormant])
+        needed = [key for key in seen if key in self._dormant]
+        if needed:
+            self._wake(needed, self._corrections())
         self._put_to_sleep(seen)
         window = self._window
         for group in self.builder.factor_groups(step, self.value):
             if group.new is not None:
                 window.insert(*group.new)
-            *others, last = group.factors
-            window.factors += [WindowFactor(factor, tuple(factor.keys())) for factor in others]
-            keys = tuple(last.keys())
-            window.factors.append(WindowFactor(last, keys, group.observed, group.robust))
+            window.factors += _window_factors(group)
+        self._optimise()
+        self._marginalise_before(step.time_ns - self._horizon_ns, self.covariance)
+
+    def _seen_in(self, step: Step) -> set[int]:
+        """The landmarks, and the states that are kept, of which a step tells."""
+        seen = {
+            factors.landmark_key(a.target) for a in step.associations if isinstance(a.target, int)
+        }
+        ends = {end for closure in step.closures for end in closure.pair}
+        return seen | {self._kept[end] for end in ends & self._kept.keys()}
+
+    def _optimise(self) -> None:
         self._z = None
         try:
-            window.optimise()
+            self._window.optimise()
         except IndeterminateWindowError as error:
             raise self.builder.indeterminate_at(error.key) from error
-        self._marginalise_before(step.time_ns - self._horizon_ns)
+
+    def current_estimate(self) -> Estimate:
+        """Means of all states, those that left as they were then, and of landmarks.
+
+        Covariances are NaN. Only before the first `forget`.
+        """
+        means = {
+            key: self._past[key][0] if key in self._past else self.value(key, dim)
+            for key, dim in self.builder.dims().items()
+        }
+        nothing = {key: (mean, np.full((len(mean),) * 2, np.nan)) for key, mean in means.items()}
+        return self.builder.estimate(nothing, self._window.half_error())
+
+    def restart(self, steps: Sequence[Step], start: Estimate) -> None:
+        """Forget all; go on after ``steps``, linearised where ``start`` has their variables.
+
+        Nothing is solved on the way, so it takes a third of the time of adding the steps. States
+        that left have no covariance. ``start`` should be the solution of the steps: past states
+        leave what they tell there.
+
+        Raises:
+            EstimationError: a covariance is not positive definite and finite, or the window is
+                indeterminate.
+        """
+        kept, self._kept = self._kept.keys(), {}
+        self.builder = _builder(lines=False)
+        self._joints.clear()
+        self._begin()
+        for first in range(0, len(steps), REPLAYED_AT_ONCE):
+            self._replay(steps[first : first + REPLAYED_AT_ONCE], start, kept)
+        self.builder.makes_lines = True
+        self._optimise()
+
+    def _replay(
+        self, steps: Sequence[Step], start: Estimate, kept: Collection[tuple[str, int]]
+    ) -> None:
+        """Take in steps of the past, linearised where ``start`` has their variables."""
+        window = self._window
+        lines: list[tuple[int, int, Association]] = []
+        seen = {key for step in steps for key in self._seen_in(step)}
+        self._wake([key for key in seen if key in self._dormant])
+        self._put_to_sleep(seen)
+        for step in steps:
+            for group in self.builder.factor_groups(
+                step, lambda key, _dim: self.builder.value_in(start, key)
+            ):
+                if group.new is not None:
+                    window.insert(group.new[0], self.builder.value_in(start, group.new[0]))
+                if group.observed is not None and group.observed[2].model == "line":
+                    lines.append(group.observed)
+                    made = replace(group, observed=None, robust=False)  # at most that of a gauge
+                    window.factors += _window_factors(made)
+                else:
+                    window.factors += _window_factors(group)
+            for robot in step.motions:
+                if (robot, step.time_ns) in kept:
+                    self.keep(robot, step.time_ns)
+        of_lines = self.builder.line_factors_at_estimate(lines, self.value)
+        window.factors += [
+            WindowFactor(factor, tuple(factor.keys()), observed, robust=True)
+            for factor, observed in zip(of_lines, lines, strict=True)
+        ]
+        window.order()
+        unknown = np.full((3, 3), np.nan)
+        self._marginalise_before(steps[-1].time_ns - self._horizon_ns, lambda _keys: unknown)
 
     def _take_known(self, known: KnownLandmarks) -> None:
         """Known landmarks begin in the prior, at their means; what is not seen becomes dormant."""
@@ -123,13 +203,11 @@ class FixedLagBackend(GraphBackend):
             rows.append(Rows(dims, row, np.zeros(len(row))))
         self._window.absorb(rows)
 
-    def _wake(self, keys: Sequence[int]) -> None:
-        """Take dormant landmarks that are seen again into the window."""
-        if keys:
-            z = self._corrections()
-            for key in keys:
-                self._window.insert(key, self._points.pop(key), z[key])
-            self._window.absorb(self._dormant.wake(keys))
+    def _wake(self, keys: Sequence[int], z: Mapping[int, Array] = NO_CORRECTIONS) -> None:
+        """Take dormant landmarks that are seen again into the window, with these corrections."""
+        for key in keys:
+            self._window.insert(key, self._points.pop(key), z.get(key))
+        self._window.absorb(self._dormant.wake(keys))
 
     def _put_to_sleep(self, needed: Iterable[int]) -> None:
         """Make landmarks dormant that the window does not see, nor the next step."""
@@ -148,8 +226,11 @@ class FixedLagBackend(GraphBackend):
             window.prior = self._dormant.add(window.prior, keys)
             window.remove(keys)
 
-    def _marginalise_before(self, before_ns: int) -> None:
-        """Marginalise the states before ``before_ns`` out, but no robot's latest."""
+    def _marginalise_before(self, before_ns: int, covariance: Callable[[list[int]], Array]) -> None:
+        """Marginalise the states before ``before_ns`` out, but no robot's latest.
+
+        ``covariance``: with which each is remembered.
+        """
         if self.most_states is not None:
             inside = [
                 time
@@ -167,7 +248,7 @@ class FixedLagBackend(GraphBackend):
             self.builder.oldest[robot] = oldest
         if leaving:
             for key in leaving:
-                self._past[key] = self.value(key, 3), self.covariance([key])
+                self._past[key] = self.value(key, 3), covariance([key])
             self._marginalise(set(leaving))
 
     def _marginalise(self, leaving: set[int]) -> None:
@@ -279,3 +360,16 @@ class FixedLagBackend(GraphBackend):
         dims = {**self._window.dims, **self._dormant.dims}
         left = {key: dim for key, dim in dims.items() if key not in self._past}
         return self.builder.estimate(self._past | self.marginals(left), self._window.half_error())
+
+
+def _builder(*, lines: bool = True) -> GraphBuilder:
+    """Factors without kernels: weights are by residuals at the estimate, applied by the window."""
+    return GraphBuilder(RobustConfig(kernel="none"), wide=False, lines=lines)
+
+
+def _window_factors(group: FactorGroup) -> list[WindowFactor]:
+    """The factors of a group; its kernel and its observation are those of the last one."""
+    made = [WindowFactor(factor, tuple(factor.keys())) for factor in group.factors]
+    if made:
+        made[-1].observed, made[-1].robust = group.observed, group.robust
+    return made

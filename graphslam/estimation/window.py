@@ -99,15 +99,20 @@ class Window:
         """Linearisation point of a variable."""
         return factors.read(self._points, key, self.dims[key])
 
+    def order(self) -> dict[int, int]:
+        """Give all variables their columns, those of the prior first; the variables so ordered."""
+        prior = self.prior.dims
+        dims = {**prior, **{key: d for key, d in self.dims.items() if key not in prior}}
+        self.slices = column_slices(dims)
+        return dims
+
     def optimise(self) -> None:
         """Gauss-Newton on all factors and the prior, from the current estimate.
 
         Raises:
             IndeterminateWindowError: they do not determine all variables.
         """
-        prior = self.prior.dims
-        dims = {**prior, **{key: d for key, d in self.dims.items() if key not in prior}}
-        self.slices = column_slices(dims)
+        dims = self.order()
         columns = self._columns(self.factors)
         made = [each.rows for each in self.factors]
         rows = np.array([np.zeros((3, _WIDTH)) if each is None else each for each in made])

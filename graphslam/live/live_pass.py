@@ -29,6 +29,9 @@ from graphslam.slam.synchronisation import ODOMETRY
 BUSY = 2
 #: s: odometry that is kept, at least
 SHORTEST_MEMORY_S = 10.0
+#: the beginning of a drive is solved as a batch until there are so many steps, or so long, ns: what
+#: follows is compared with its map, moved with its calibration. The last solution takes 0.2 s
+LAST_BATCH_STEP, BEGINNING_NS = 400, 900_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,20 +69,22 @@ class LivePass(Pipeline):
     """A pass that reports each robot where it is, and forgets what is behind its horizon."""
 
     backend: FixedLagBackend
+    batch_step_growth = 2.0  # with 1.25 as good, but thrice as many scans wait
 
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
         """For the arguments see `LogPass`; the back end has a finite horizon."""
+        self._known_map = known.known_map
         super().__init__(log, config, known)
         self.backend.most_states = config.live.max_states
         memory_s = max(self.config.backend.horizon_s, SHORTEST_MEMORY_S)
         self._memory_ns = round(1e9 * memory_s)
-        self._known_map = known.known_map
         if self._known_map is not None:
             self.landmarks.add_known(self._known_map.entries(min(self.runs)))
             self.landmarks.begin_at(self._known_map.next_number)
         #: known landmarks that were seen, and how many observations were of them, and of others
         self.known_seen: set[int] = set()
         self.on_map = self.off_map = 0
+        self._taken = 0  # of `steps`, by the events before
         self._reported: dict[str, LiveEstimate] = {}
         self._closures = 0  # that are in `_closed_ns`, or were reported
         self._closed_ns: dict[str, int] = {}  # from when on a robot's next estimate has a closure
@@ -100,7 +105,7 @@ class LivePass(Pipeline):
         alone = len(self.runs) == 1 and all(map(self.log.has_scans, self.runs))
         waiting = False
         for event in self.process(messages):
-            if not self.steps and not waiting and _is_odometry(event):
+            if len(self.steps) == self._taken and not waiting and _is_odometry(event):
                 continue  # most of a recording: nothing was seen, and nothing is to be forgotten
             self.record_covariances()
             self._note_closures()
@@ -143,13 +148,25 @@ class LivePass(Pipeline):
         found = self._closer.closures(self.last_ns)
         if not found:
             return
-        self.backend.add(Step(self.last_ns, closures=found))
+        step = Step(self.last_ns, closures=found)
+        self.backend.add(step)
+        self.steps.append(step)
         self.associator.closures += 1
         for robot, run in self.started.items():
             # what is reported from now on is seen from there
             run.latest_pose = run.causal_poses[-1] = self.backend.state_mean(robot)
             del run.causal_covs[len(run.times) - 1 :]
         self._note_closures(of_places=True)
+
+    def restarts(self) -> bool:
+        """See `StepRecorder`: in the beginning, while all that was seen is kept."""
+        return self._known_map is None
+
+    def _is_beginning(self) -> bool:
+        """Whether there will be a batch step, for which steps and odometry are to be kept."""
+        if self.next_batch_step > LAST_BATCH_STEP or self.last_ns > self.first_ns + BEGINNING_NS:
+            self.next_batch_step = math.inf
+        return math.isfinite(self.next_batch_step)
 
     def start_step(self, robot: str, time_ns: int) -> Step:
         """See `StepRecorder`; a known map enters with the first robot."""
@@ -241,24 +258,30 @@ class LivePass(Pipeline):
         """Drop what no later message needs."""
         self._count_known()
         for history in (
-            self.steps, self.offers, self.sources, self.robot_sightings, self.unrelated_sightings,
+            self.offers, self.sources, self.robot_sightings, self.unrelated_sightings,
             self.keyframe_scans, self.step_ms, self.innovations,
         ):  # fmt: skip
             history.clear()
         self._placed = 0
+        beginning = self._is_beginning()
+        if not beginning:
+            self.steps.clear()
+        self._taken = len(self.steps)
         before_ns = self.last_ns - self._memory_ns
         for robot, run in self.started.items():
             # from the last state on: while a robot stands its latest scan stays its first one
             self.landmarks.expire(run.state_ns, robot, math.inf, self._memory_ns, 0.0)
             first = min(before_ns, run.state_ns)
-            run.track.forget_before(first)
+            if not beginning:
+                run.track.forget_before(first)
             run.repeats.left_out.clear()
             # half of them at a time, so that each is moved once on average
             behind = int(np.searchsorted(run.times[:-1], first))
             if 2 * behind > len(run.times):
                 for states in (run.times, run.causal_poses, run.causal_covs, run.calibrations):
                     del states[:behind]
-        self.backend.forget()
+        if not beginning:
+            self.backend.forget()
 
     def landmark_map(self) -> tuple[Landmark, ...]:
         """The landmarks of the map as estimated now, in their frames."""

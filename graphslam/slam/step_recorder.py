@@ -12,6 +12,7 @@ from graphslam.core.records import Association, Motion, Step
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.batch_calibration import calibrate_so_far, recompute_motions
 from graphslam.estimation.compressed_filter import CompressedBackend
+from graphslam.estimation.fixed_lag import FixedLagBackend
 from graphslam.logs import LogSet
 from graphslam.mapping.data_association import Associator
 from graphslam.odometry.online_calibration import observed_information
@@ -26,7 +27,12 @@ FIRST_BATCH_STEP, BATCH_STEP_GROWTH = 100, 1.25
 
 
 class StepRecorder(LogPass):
-    """A pass that gives each step to a back end, and its observations to an associator."""
+    """A pass that gives each step to a back end, and its observations to an associator.
+
+    ``next_batch_step``: the number of steps at which there is the next `batch_step`.
+    """
+
+    batch_step_growth = BATCH_STEP_GROWTH
 
     def __init__(
         self, log: LogSet, config: Config, known: PriorKnowledge, *, batch_steps: bool = True
@@ -44,7 +50,11 @@ class StepRecorder(LogPass):
         starts = known.recorded.start_times()
         # scans have states of their own nearby, each checked against the one before
         self._closure_starts = {r: deque(t) for r, t in starts.items() if not log.has_scans(r)}
-        self._next_batch_step = FIRST_BATCH_STEP if wanted else math.inf  # number of steps
+        self.next_batch_step = FIRST_BATCH_STEP if wanted and self.restarts() else math.inf
+
+    def restarts(self) -> bool:
+        """Whether the back end may go on from a solution of all steps: it has no horizon."""
+        return isinstance(self.backend, CompressedBackend)
 
     @property
     def skipped(self) -> Mapping[str, int]:
@@ -122,8 +132,8 @@ class StepRecorder(LogPass):
             poses = {name: self.backend.state_mean(name) for name in step.motions}
             if self.config.odometry.calibrate:
                 self.learn(step, poses, known)
-            if len(self.steps) >= self._next_batch_step:
-                self._next_batch_step = round(BATCH_STEP_GROWTH * len(self.steps))
+            if len(self.steps) >= self.next_batch_step:
+                self.next_batch_step = round(self.batch_step_growth * len(self.steps))
                 if self.batch_step():
                     poses = {name: self.runs[name].latest_pose for name in poses}
             for name, pose in poses.items():
@@ -139,13 +149,13 @@ class StepRecorder(LogPass):
         Mapping, T-RO 24(6), 2008, DOI 10.1109/TRO.2008.2006706.
 
         Returns:
-            Whether that was done: not if the back end does not smooth all states, if there is
-            nothing to calibrate, as without odometry, or if the solution fails.
+            Whether that was done: not if there is nothing to calibrate, as without odometry, or if
+            the solution fails.
         """
         backend = self.backend
         tracks = {name: run.track for name, run in self.started.items()}
         held = all(track.prior.is_held for track in tracks.values())
-        if held or not isinstance(backend, CompressedBackend):
+        if held or not isinstance(backend, CompressedBackend | FixedLagBackend):
             return False
         try:
             found = calibrate_so_far(
