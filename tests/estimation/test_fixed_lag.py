@@ -244,3 +244,43 @@ def test_the_latest_state_of_each_robot_stays():
     for robot in "ab":
         assert np.isfinite(backend.state_mean(robot)).all()
         assert np.linalg.eigvalsh(backend.joint(robot, []).cov).min() > 0
+
+
+@pytest.mark.parametrize("robots", ["a", "ab"])
+@pytest.mark.parametrize("horizon_s", [2.0, 5.0])
+def test_a_window_built_again_at_the_solution_is_of_the_whole_past(horizon_s, robots):
+    """Means and covariances are those of a smoother without horizon; so they stay afterwards.
+
+    What left a window while it was added is linearised where it was believed to be: it is off.
+    """
+    made = rounds(3, 2 * LAP_S, robots)
+    past, rest = made[: LAP_S + 20], made[LAP_S + 20 : LAP_S + 22]
+    whole, filtered, built = smoother(1000), smoother(horizon_s), smoother(horizon_s)
+    for step in past:
+        whole.add(step)
+        filtered.add(step)
+    solved = whole.finish()
+    for step in past[:10]:  # what it had before is forgotten
+        built.add(step)
+    built.restart(past, solved)
+    everything = sorted(solved.landmarks)
+    wanted = whole.joint("a", everything, list(robots[1:]))
+    found = built.joint("a", everything, list(robots[1:]))
+    # the window is optimised once more: as well as its Gauss-Newton steps converge
+    assert off(found, wanted) < 1e-3
+    assert off(filtered.joint("a", everything, list(robots[1:])), wanted) > 5e-3
+    np.testing.assert_allclose(found.cov, wanted.cov, rtol=0, atol=2e-3 * wanted.cov.max())
+    for step in rest:
+        for backend in (whole, filtered, built):
+            backend.add(step)
+    assert set(built.finish().landmarks) == set(whole.finish().landmarks)
+    # what has left is not linearised again where the second round moves it
+    wanted = whole.joint("a", everything)
+    kept, lost = (off(one.joint("a", everything), wanted) for one in (built, filtered))
+    assert kept < 0.5 * lost
+
+
+def off(found, wanted):
+    """The largest difference of two means, m or rad."""
+    pairs = zip([found.pose, *found.landmarks], [wanted.pose, *wanted.landmarks], strict=True)
+    return max(np.abs(a - b).max() for a, b in pairs)
