@@ -35,7 +35,7 @@ from graphslam.estimation.square_root import Rows, eliminate, stacked
 from graphslam.estimation.window import IndeterminateWindowError, Window, WindowFactor
 
 #: steps after which states leave in `FixedLagBackend.restart`
-REPLAYED_AT_ONCE = 10
+REPLAYED_AT_ONCE = 20
 NO_CORRECTIONS: Mapping[int, Array] = MappingProxyType({})
 
 
