@@ -333,7 +333,7 @@ def test_robots_that_nothing_places_are_in_no_map(saved, tmp_path):
 def test_a_table_of_poses_says_in_which_frame_they_are(saved, tmp_path):
     """As landmarks.csv does. Drawn from the table alone, two frames would look like one world."""
     _, result = saved
-    robots = {name: result.robots["robot"] for name in ("robot", "other")}
+    robots = dict.fromkeys(("robot", "other"), result.robots["robot"])
     summary = {**result.summary, "world": "robot", "frames": {"robot": "robot", "other": "other"}}
     save(replace(result, robots=robots, summary=summary), tmp_path / "out", force=False)
     make_map(tmp_path / "out", tmp_path / "out")
