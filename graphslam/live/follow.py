@@ -19,14 +19,14 @@ from graphslam.core.worker import Future
 from graphslam.live.history import History
 from graphslam.live.live_folder import write_live_folder
 from graphslam.live.live_pass import LiveEstimate
-from graphslam.live.session import INTRODUCTION_S, Session, live_config
+from graphslam.live.session import INTRODUCTION_S, LATE, Session, dropped_by, live_config
 from graphslam.logs import LogSet
 from graphslam.logs.file_reader import FileReader, decoded
 from graphslam.logs.future_stamps import Recorded
 from graphslam.logs.growing_mcap import GrowingMcap, open_growing
 from graphslam.logs.log_set import damage, log_set_of
 from graphslam.logs.recording import Recording, deriver
-from graphslam.logs.time_order import DROPPED, TOO_LATE, MessageSorter
+from graphslam.logs.time_order import DROPPED, MessageSorter
 from graphslam.logs.wheel_turns import with_whole_turns
 from graphslam.results.target_folder import check_target
 
@@ -153,9 +153,10 @@ def _messages(
 
     folder.sorter = reader.sorter
     yield from with_whole_turns(reader.sorted(recorded()), log.wrapped, folder.repaired)
+    folder.dropped += dropped_by(reader.sorter)
+    folder.sorter = None
     for counts in reader.sorter.counts.values():
-        folder.dropped += Counter({kind: counts.pop(kind, 0) for kind in DROPPED})
-        folder.repaired.update(counts)
+        folder.repaired.update({kind: n for kind, n in counts.items() if kind not in DROPPED})
 
 
 class _Folder:
@@ -165,7 +166,7 @@ class _Folder:
         self.history, self.warnings = History(), list(log.warnings)
         self.dropped: Counter[str] = Counter()
         self.repaired: Counter[str] = Counter()
-        #: whose counts are moved to the others in the end
+        #: whose counts are added to the others in the end
         self.sorter: MessageSorter | None = None
         self._target, self._before, self._session, self._log = target, before, session, log
         self._writing: Future[Identity] | None = None
@@ -223,8 +224,8 @@ class _Folder:
         log, history, session = self._log, self.history, self._session
         counts, known_map = session.counts, session.known_map
         dropped = self.dropped + session.dropped
-        for late in self.sorter.counts.values() if self.sorter is not None else ():
-            dropped += Counter({kind: late.get(kind, 0) for kind in DROPPED})
+        if self.sorter is not None:
+            dropped += dropped_by(self.sorter)
         return {
             "logs": [
                 {
@@ -251,7 +252,7 @@ class _Folder:
                 *self.warnings,
                 *_unplaced(session),
                 *_astray(known_map),
-                *_too_late(dropped[TOO_LATE], counts.get("scans", 0)),
+                *_too_late(dropped[LATE], counts.get("scans", 0)),
             ],
             "live": {
                 "state": state,

@@ -18,7 +18,7 @@ from graphslam.live.live_pass import LiveEstimate, LivePass
 from graphslam.logs import LogSet
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.record_checks import UnusableMessageError, checked
-from graphslam.logs.time_order import DROPPED, MessageSorter
+from graphslam.logs.time_order import DROPPED, TOO_LATE, MessageSorter
 from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.results.known_map_file import known_map_of
@@ -33,6 +33,8 @@ INTRODUCTION_S = 2.0
 #: ns: a single stamp that is so much later than all before is wrong, and a first one so far off
 LEAP_NS = 10_000_000_000
 LEAP = "stamp: far later than those before and after"
+#: in place of `TOO_LATE`: the window is that of another setting
+LATE = "stamp: older than live.reorder_s allows"
 FIRST_LEAP = "stamp: far from all others at the beginning"
 
 
@@ -96,8 +98,7 @@ class Session:
         """Number of messages so far that were not used, by reason."""
         found = self._unused.copy()
         if self._sorter is not None:
-            for counts in self._sorter.counts.values():
-                found += Counter({kind: counts[kind] for kind in DROPPED})
+            found += dropped_by(self._sorter)
         return found if self._pass is None else found + self._pass.dropped
 
     @property
@@ -223,6 +224,15 @@ def _sorted(messages: Iterable[Message], sorter: MessageSorter) -> Iterator[Mess
     for message in messages:
         yield from sorter.push(f"{message.robot} {type(message).__name__}", message)
     yield from sorter.finish()
+
+
+def dropped_by(sorter: MessageSorter) -> Counter[str]:
+    """What a sorter with the window ``live.reorder_s`` left out so far, by reason."""
+    found: Counter[str] = Counter()
+    for counts in sorter.counts.values():
+        for kind in DROPPED:
+            found[LATE if kind == TOO_LATE else kind] += counts[kind]
+    return +found
 
 
 def _names_records(robots: object) -> bool:

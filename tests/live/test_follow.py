@@ -217,6 +217,8 @@ def test_a_clock_that_is_set_back_is_said(room, tmp_path):
     summary = graphslam.follow(tmp_path / "back.mcap", tmp_path / "now")
     (said,) = (line for line in summary["warnings"] if "a clock was set back" in line)
     assert int(said.split()[0]) > 0.4 * half
+    (reason,) = (key for key in summary["dropped"] if key.startswith("stamp: older"))
+    assert "live.reorder_s" in reason  # logs.reorder_s is not used
     assert 0.4 < summary["live"]["estimates"] / summary["counts"]["scans"] <= 1.0
 
 
@@ -232,6 +234,13 @@ def test_what_is_lost_is_said(room, tmp_path):
     assert file["lost"] == known.files[0].lost > 0
     assert (file["messages"], file["sha256"]) == (known.files[0].messages, known.files[0].sha256)
     assert any("messages are lost" in warning for warning in told["warnings"])
+
+
+def test_a_followed_recording_is_no_map_yet_and_says_so(room, tmp_path):
+    """It has no joint covariance of its landmarks; it is not of another version."""
+    graphslam.follow(room, tmp_path / "live")
+    with pytest.raises(graphslam.OutputError, match=r"live: is of `graphslam follow`.* smooth "):
+        graphslam.smooth(room, **{"known_map.directory": str(tmp_path / "live")})
 
 
 @pytest.mark.parametrize(("start", "astray"), [([0.0, 0.0, 0.0], False), ([3.0, 2.5, 2.0], True)])
