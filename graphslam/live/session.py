@@ -15,6 +15,7 @@ from graphslam.core.errors import ConfigError, EstimationError, LogError
 from graphslam.core.records import Landmark, Message, Scan, Sighting
 from graphslam.core.suggestions import start_option
 from graphslam.live.live_pass import LiveEstimate, LivePass
+from graphslam.live.repeated_messages import without_repeated
 from graphslam.logs import LogSet
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.record_checks import UnusableMessageError, checked
@@ -184,7 +185,7 @@ class Session:
             )
         check_robots(self._log, self.config)
         self._pass = LivePass(self._log, self.config, known_starts(self._log, self.config))
-        yield from self._pass.estimates(messages, ready)
+        yield from self._pass.estimates(without_repeated(messages, self._unused), ready)
 
     def _records(self, messages: Iterable[Message]) -> Iterator[Message]:
         """What is a message at all, but for the truth, which may have a clock of its own."""
