@@ -133,21 +133,22 @@ class MessageSorter:
             self.counts[topic] = Counter()
             repair = self._repairs[topic] = _GlitchRepair(self._window_ns, self.counts[topic])
         self._recorded += 1
-        late = self.counts[topic][TOO_LATE]
+        counts = self.counts[topic]
+        late = counts.get(TOO_LATE, 0)
         if message.time_ns != message.stamp_ns:
-            self.counts[topic][GLITCH] += 1
+            counts[GLITCH] += 1
         settled = repair.push(message, self._recorded) if self._repair else [message]
         if settled:
             self._place(topic, settled)
-        self._note_late(topic, self.counts[topic][TOO_LATE] - late)
+        late = counts.get(TOO_LATE, 0) - late
+        if late or topic in self._late_now:
+            self._note_late(topic, late)
         if self._latest_ns < self._checked_ns + self._window_ns // _EMISSIONS_PER_WINDOW:
             return ()
         return self._release()
 
     def _note_late(self, topic: str, late: int) -> None:
         """Count messages in a row that came too late: a clock that was set back makes a row."""
-        if not late and topic not in self._late_now:
-            return
         self._late_now[topic] += late
         self.late_in_a_row[topic] = max(self.late_in_a_row[topic], self._late_now[topic])
         if not late:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import call
 from paths import LOGS
 from room_log import SCAN, S, drive
 
@@ -263,6 +264,18 @@ def test_what_begins_too_late_to_be_followed_is_said_at_once_and_counted(
     assert sum(counts.values()) == 150 + 31
     (last,) = (line for line in told["warnings"] if "began later" in line)
     assert "181 messages so far are left out" in last
+
+
+def test_the_command_says_at_once_what_it_does_not_follow(room, tmp_path, monkeypatch):
+    """On stderr, without --verbose; and again in the end, with what was dropped."""
+    both = two_robots(room, tmp_path / "both.mcap", 15)
+    recorder = Recorder(both, tmp_path / "now.mcap", monkeypatch)
+    done = call("follow", recorder.path, "-o", tmp_path / "out")
+    assert done.code == 0
+    assert done.err.startswith("graphslam: warning: /other/odom, /other/scan: began later than")
+    assert done.err.count("\n") == 1
+    assert "warning: /other/odom, /other/scan: began later than what is followed" in done.out
+    assert "dropped: 31 x /other/scan: began later than what is followed" in done.out
 
 
 def test_a_robot_whose_start_is_given_is_waited_for(room, tmp_path, monkeypatch):
