@@ -9,6 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
+from graphslam.cli.interrupts import is_interrupt
+
 #: environment variables by which the libraries under numpy and scipy choose their threads
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 #: new objects between two garbage collections: a run makes millions of records and hardly any
@@ -46,7 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if arguments is None and isinstance(done.code, int):
             _end_process(done.code)
         raise
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Exception) as error:
+        if not is_interrupt(error):
+            raise
         if arguments is None:
             _end_process(BY_SIGNAL + signal.SIGINT)
         raise SystemExit(BY_SIGNAL + signal.SIGINT) from None

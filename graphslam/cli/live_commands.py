@@ -68,13 +68,17 @@ def follow(
     if horizon is not None:
         chosen = ["backend.name=isam2", *chosen]
     tree = load_config(config, chosen, preset)
-    told = graphslam.follow(recording, output, config=tree, force=force, announce=_say)
+    told = graphslam.follow(recording, output, config=tree, force=force, announce=_say, warn=_warn)
     return Output(told, lambda: _followed(told, output))
 
 
 def _say(text: str) -> None:
     if terminal.output.verbose:
         typer.echo(text, err=True)
+
+
+def _warn(text: str) -> None:
+    terminal.note(f"warning: {text}")
 
 
 def _followed(told: dict[str, Any], output: Path) -> None:

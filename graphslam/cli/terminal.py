@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import typer
 
+from graphslam.cli.interrupts import is_interrupt
 from graphslam.core.errors import GraphSlamError
 
 DRAW_INTERVAL_S = 0.1  # smooth to the eye, and drawing takes no noticeable time
@@ -41,6 +42,8 @@ def errors_in_one_line(debug: bool) -> Iterator[None]:
     except (typer.Exit, typer.BadParameter, BrokenPipeError):  # the output is no longer read
         raise
     except Exception as error:
+        if is_interrupt(error):
+            raise typer.Exit(INTERRUPTED) from None
         if debug:
             raise
         typer.echo(f"graphslam: error: {_describe(error)}", err=True)

@@ -15,10 +15,11 @@ from graphslam.core.errors import ConfigError, EstimationError, LogError
 from graphslam.core.records import Landmark, Message, Scan, Sighting
 from graphslam.core.suggestions import start_option
 from graphslam.live.live_pass import LiveEstimate, LivePass
+from graphslam.live.repeated_messages import without_repeated
 from graphslam.logs import LogSet
 from graphslam.logs.decoders import TopicContext
 from graphslam.logs.record_checks import UnusableMessageError, checked
-from graphslam.logs.time_order import DROPPED, MessageSorter
+from graphslam.logs.time_order import DROPPED, TOO_LATE, MessageSorter
 from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.results.known_map_file import known_map_of
@@ -30,9 +31,12 @@ from graphslam.slam.start_priors import origin, start_poses
 
 #: s of messages by which the robots and their sensors are known, if nobody tells them
 INTRODUCTION_S = 2.0
-#: ns: a single stamp that is so much later than all before is wrong
+#: ns: a single stamp that is so much later than all before is wrong, and a first one so far off
 LEAP_NS = 10_000_000_000
 LEAP = "stamp: far later than those before and after"
+#: in place of `TOO_LATE`: the window is that of another setting
+LATE = "stamp: older than live.reorder_s allows"
+FIRST_LEAP = "stamp: far from all others at the beginning"
 
 
 class Session:
@@ -80,6 +84,7 @@ class Session:
         self._unused: Counter[str] = Counter()
         self._sorter: MessageSorter | None = None
         self._log = log
+        self._announced = robots is not None  # not found out
         if robots is not None and not _names_records(robots):
             raise ConfigError(
                 "Session(robots=...): needs a dict of what each sends, such as "
@@ -94,8 +99,7 @@ class Session:
         """Number of messages so far that were not used, by reason."""
         found = self._unused.copy()
         if self._sorter is not None:
-            for counts in self._sorter.counts.values():
-                found += Counter({kind: counts[kind] for kind in DROPPED})
+            found += dropped_by(self._sorter)
         return found if self._pass is None else found + self._pass.dropped
 
     @property
@@ -148,13 +152,17 @@ class Session:
         """
         rest = self._records(messages)
         if self._log is None:
+            # a wrong stamp must neither end the introduction nor keep it from ending
+            rest = without_leaps(rest, self._unused)
             first, kinds = introduced(rest)
             self._log = expected_log(kinds, self.config)
-            rest = chain(first, rest)
+            rest = self._expected(chain(first, rest))
+        else:
+            rest = without_leaps(self._expected(rest), self._unused)
         # messages come in any order, and what comes late says nothing of the stamps of the others
         sorter = MessageSorter(round(1e9 * self.config.live.reorder_s), repair=False)
         self._sorter = sorter
-        in_order = _sorted(self._expected(rest), sorter, self._unused)
+        in_order = _sorted(rest, sorter)
         yield from self.process_sorted(in_order, sorter.ready)
 
     def process_sorted(
@@ -177,30 +185,31 @@ class Session:
             )
         check_robots(self._log, self.config)
         self._pass = LivePass(self._log, self.config, known_starts(self._log, self.config))
-        yield from self._pass.estimates(messages, ready)
+        yield from self._pass.estimates(without_repeated(messages, self._unused), ready)
 
     def _records(self, messages: Iterable[Message]) -> Iterator[Message]:
-        """What is a message at all."""
+        """What is a message at all, but for the truth, which may have a clock of its own."""
         for message in messages:
             if not isinstance(message, Message):
                 self._unused[f"{type(message).__name__}: is no record of graphslam"] += 1
             elif not (isinstance(message.robot, str) and isinstance(message.time_ns, Integral)):
                 what = type(message).__name__
                 self._unused[f"{what}: robot must be a text, time_ns a whole number"] += 1
-            else:
+            elif not isinstance(message, TRUE_RECORDS):
                 yield message
 
     def _expected(self, messages: Iterable[Message]) -> Iterator[Message]:
         """The messages that can be used."""
         assert self._log is not None
         kinds = {(topic.robot, topic.record) for topic in self._log.topics}
+        moving = {robot for robot, kind in kinds if kind in ODOMETRY_KINDS}
         for message in messages:
-            if isinstance(message, TRUE_RECORDS):
-                continue
             if (message.robot, type(message)) not in kinds:
                 what = type(message).__name__.lower()
-                why = f"{message.robot} did not send any at first"
-                if isinstance(message, ODOMETRY_KINDS):
+                why = f"{message.robot} was not to send any, by Session(robots=...)"
+                if not self._announced:
+                    why = f"{message.robot} did not send any in the first {INTRODUCTION_S:g} s"
+                if isinstance(message, ODOMETRY_KINDS) and message.robot in moving:
                     why = f"not used, as {message.robot} has another kind of odometry"
                 self._unused[f"{what}: {why}"] += 1
                 continue
@@ -212,12 +221,19 @@ class Session:
                 yield usable
 
 
-def _sorted(
-    messages: Iterable[Message], sorter: MessageSorter, dropped: Counter[str]
-) -> Iterator[Message]:
-    for message in without_leaps(messages, dropped):
+def _sorted(messages: Iterable[Message], sorter: MessageSorter) -> Iterator[Message]:
+    for message in messages:
         yield from sorter.push(f"{message.robot} {type(message).__name__}", message)
     yield from sorter.finish()
+
+
+def dropped_by(sorter: MessageSorter) -> Counter[str]:
+    """What a sorter with the window ``live.reorder_s`` left out so far, by reason."""
+    found: Counter[str] = Counter()
+    for counts in sorter.counts.values():
+        for kind in DROPPED:
+            found[LATE if kind == TOO_LATE else kind] += counts[kind]
+    return +found
 
 
 def _names_records(robots: object) -> bool:
@@ -233,11 +249,11 @@ def without_leaps(messages: Iterable[Message], dropped: Counter[str]) -> Iterato
     """The messages without those that are stamped far later than the ones before and after them.
 
     Sorted by time, all that comes after one would be too late. Where two stamps in a row are far
-    later, time did go on.
+    later, time did go on. So is a first stamp left out that is far from the two after it.
     """
     latest_ns: int | None = None
     leapt: list[Message] = []  # of one stamp
-    for message in messages:
+    for message in _without_first_leap(iter(messages), dropped):
         leaps = latest_ns is not None and message.time_ns > latest_ns + LEAP_NS
         if leaps and (not leapt or message.time_ns == leapt[0].time_ns):
             leapt.append(message)
@@ -251,6 +267,41 @@ def without_leaps(messages: Iterable[Message], dropped: Counter[str]) -> Iterato
         yield message
     if leapt:
         dropped[LEAP] += len(leapt)
+
+
+def _without_first_leap(messages: Iterator[Message], dropped: Counter[str]) -> Iterator[Message]:
+    """The messages without those at the beginning whose stamps are far from all others there.
+
+    Of the first two stamps that are far from each other the third one tells which is wrong.
+    """
+    groups: list[list[Message]] = []  # of equal stamps
+    for message in messages:
+        if groups and message.time_ns == groups[-1][0].time_ns:
+            groups[-1].append(message)
+            continue
+        groups.append([message])
+        if len(groups) == 3 or (len(groups) == 2 and _are_near(*groups)):
+            break
+    wrong: list[Message] | None = None
+    if len(groups) == 3:
+        first, second, third = groups
+        wrong = first if _are_near(second, third) else second if _are_near(first, third) else None
+        dropped[FIRST_LEAP] += len(wrong or ())
+    begin = [message for group in groups if group is not wrong for message in group]
+    yield from begin
+    for message in messages:  # sorted by time, one far before the first would be the beginning
+        if message.time_ns < begin[0].time_ns - LEAP_NS:
+            dropped[FIRST_LEAP] += 1
+            continue
+        yield message
+        if message.time_ns > begin[0].time_ns + 1e9 * INTRODUCTION_S:
+            break
+    yield from messages
+
+
+def _are_near(a: list[Message], b: list[Message]) -> bool:
+    """Whether two groups of equal stamps may follow each other."""
+    return abs(a[0].time_ns - b[0].time_ns) <= LEAP_NS
 
 
 def live_config(config: Config) -> Config:
@@ -281,18 +332,27 @@ def live_config(config: Config) -> Config:
 def introduced(
     messages: Iterator[Message],
 ) -> tuple[list[Message], dict[str, list[type[Message]]]]:
-    """The first messages, and the records that each robot sent in them."""
+    """The first messages, and the records that each robot sent in them.
+
+    They end when one kind of a robot's messages has come for `INTRODUCTION_S`. A clock that is set
+    meanwhile, and clocks that disagree, do not end them.
+    """
     first: list[Message] = []
     kinds: dict[str, list[type[Message]]] = {}
+    latest_ns: dict[tuple[str, type[Message]], int] = {}
+    lasted_ns: Counter[tuple[str, type[Message]]] = Counter()
     for message in messages:
         first.append(message)
-        if isinstance(message, TRUE_RECORDS):
-            continue
-        own = kinds.setdefault(message.robot, [])
-        if type(message) not in own:
-            own.append(type(message))
-        if message.time_ns - first[0].time_ns > 1e9 * INTRODUCTION_S:
+        key, now_ns = (message.robot, type(message)), message.time_ns
+        if key not in latest_ns:
+            kinds.setdefault(message.robot, []).append(type(message))
+            latest_ns[key] = now_ns
+        step_ns = now_ns - latest_ns[key]
+        lasted_ns[key] += step_ns if 0 < step_ns <= LEAP_NS else 0
+        if lasted_ns[key] > 1e9 * INTRODUCTION_S:
             break
+        if step_ns > 0 or step_ns < -LEAP_NS:
+            latest_ns[key] = now_ns
     return first, kinds
 
 

@@ -67,6 +67,15 @@ class GrowingMcap:
         """What was read so far, as a recording."""
         return Recording(self.path, (self._indexer.result(),))
 
+    def kinds(self) -> dict[str, tuple[str, str]]:
+        """Schema and encoding of the topics that are described so far, see `RawTopic`."""
+        found = {}
+        for channel in self._indexer.described().values():
+            known = translation(channel.schema, channel.encoding)
+            kind = (known.schema, "cdr") if known else (channel.schema, channel.encoding)
+            found[channel.topic] = kind
+        return found
+
     def messages(self) -> Iterator[RawMessage]:
         """The messages that `poll` found and that were not given yet, translated."""
         channels = {}

@@ -188,7 +188,7 @@ def _gaps(log: CheckedLog) -> Iterable[Finding]:
             remedy = "scans and sightings in gaps longer than odometry.max_gap_s are dropped: "
             remedy += f"--set odometry.max_gap_s={longest + 0.1:.1f}"
             if log.recordings > 1:
-                remedy += "; recordings that are drives of their own: --same-place"
+                remedy += "; recordings that are drives of their own: smooth --same-place"
         yield Finding("doubt" if topic.used else "note", "gaps", topic.name, text, remedy)
 
 

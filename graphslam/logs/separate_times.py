@@ -61,8 +61,8 @@ def check_separate_times(
                 raise LogError(
                     f"{a.path} and {b.path}: both have {topic.name} during the same "
                     f"{(end - begin) / _SECOND:.0f} s, with different messages: two robots whose "
-                    "topics have the same names, or a wrong clock; --same-place takes each "
-                    "recording for itself, or smooth them one by one"
+                    "topics have the same names, or a wrong clock; smooth --same-place takes each "
+                    "recording for itself; other commands take them one by one (compare: --each)"
                 )
 
 

@@ -97,6 +97,7 @@ class MessageSorter:
 
     Attributes:
         counts: per topic, how many were `GLITCH`, `DUPLICATE` (kept) and of each of `DROPPED`.
+        late_in_a_row: per topic, of how many in a row none could be used, at most: `TOO_LATE`.
         ready: messages that follow the one that was passed on last, whatever is pushed next.
     """
 
@@ -106,6 +107,8 @@ class MessageSorter:
         Without ``repair`` stamps are taken for true, and the order tells when messages came.
         """
         self.counts: dict[str, Counter[str]] = {}
+        self.late_in_a_row: Counter[str] = Counter()
+        self._late_now: Counter[str] = Counter()  # the row that goes on
         self.ready: deque[Message] = deque()
         self._repair = repair
         self._window_ns = window_ns
@@ -130,14 +133,26 @@ class MessageSorter:
             self.counts[topic] = Counter()
             repair = self._repairs[topic] = _GlitchRepair(self._window_ns, self.counts[topic])
         self._recorded += 1
+        counts = self.counts[topic]
+        late = counts.get(TOO_LATE, 0)
         if message.time_ns != message.stamp_ns:
-            self.counts[topic][GLITCH] += 1
+            counts[GLITCH] += 1
         settled = repair.push(message, self._recorded) if self._repair else [message]
         if settled:
             self._place(topic, settled)
+        late = counts.get(TOO_LATE, 0) - late
+        if late or topic in self._late_now:
+            self._note_late(topic, late)
         if self._latest_ns < self._checked_ns + self._window_ns // _EMISSIONS_PER_WINDOW:
             return ()
         return self._release()
+
+    def _note_late(self, topic: str, late: int) -> None:
+        """Count messages in a row that came too late: a clock that was set back makes a row."""
+        self._late_now[topic] += late
+        self.late_in_a_row[topic] = max(self.late_in_a_row[topic], self._late_now[topic])
+        if not late:
+            del self._late_now[topic]
 
     def _release(self) -> Iterator[Message]:
         """The messages, sorted, that nothing can precede any more."""

@@ -59,6 +59,11 @@ def load_known_map(directory: Path) -> KnownMap:
             f"{RESULT_FORMAT}); smooth its log again"
         )
     check_one_frame(saved, directory)
+    if "live" in saved.summary:
+        raise OutputError(
+            f"{directory}: is of `graphslam follow`, which keeps no joint covariance of its "
+            "landmarks; smooth the recording, and use that result as the map"
+        )
     if not (directory / SCANS_FILE).exists():
         raise OutputError(f"{directory}: is of a log without scans; known maps are for scans")
     if saved.joint is None or not saved.joint.root.landmarks:

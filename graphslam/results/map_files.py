@@ -109,10 +109,11 @@ def _map_files(
     grid = grid_map(placed, resolution_m) if placed else None
     drawn = [m for m in landmarks if m.frame is None]
     own = {name: path for name, path in paths.items() if in_world(summary, name)}
+    frames = {name: summary["frames"][name] for name in paths if name not in own}
     files = [
         *(grid_map_files(grid, NAME, mode) if grid is not None else ()),
         *line_map_files(drawn, own, NAME),
         ("landmarks.csv", csv_text(LANDMARK_COLUMNS, landmark_rows(landmarks))),
-        ("trajectories.csv", csv_text(TRAJECTORY_COLUMNS, trajectory_rows(paths))),
+        ("trajectories.csv", csv_text(TRAJECTORY_COLUMNS, trajectory_rows(paths, frames))),
     ]
     return MapFiles(tuple(files), grid)

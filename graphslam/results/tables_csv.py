@@ -15,6 +15,7 @@ LANDMARK_COLUMNS = (
 )  # fmt: skip
 TRAJECTORY_COLUMNS = (
     "robot", "stamp_ns", "x_m", "y_m", "phi_rad", "x_sigma_m", "y_sigma_m", "phi_sigma_rad",
+    "frame",
 )  # fmt: skip
 
 
@@ -38,15 +39,20 @@ def landmark_rows(landmarks: Sequence[Landmark]) -> list[tuple[object, ...]]:
     ]
 
 
-def trajectory_rows(paths: Mapping[str, Trajectory]) -> list[tuple[object, ...]]:
-    """A row of `TRAJECTORY_COLUMNS` for each pose; a sigma is None where it is not known."""
+def trajectory_rows(
+    paths: Mapping[str, Trajectory], frames: Mapping[str, str]
+) -> list[tuple[object, ...]]:
+    """A row of `TRAJECTORY_COLUMNS` for each pose; a sigma is None where it is not known.
+
+    ``frames``: robot -> its frame, of those that are not in the world, where it is None.
+    """
     rows: list[tuple[object, ...]] = []
     for robot, path in sorted(paths.items()):
         variances = np.diagonal(path.covs, axis1=1, axis2=2)
         with np.errstate(invalid="ignore"):
             sigmas = np.sqrt(variances).tolist()
         rows += [
-            (robot, stamp, *pose, *(None if math.isnan(s) else s for s in sigma))
+            (robot, stamp, *pose, *(None if math.isnan(s) else s for s in sigma), frames.get(robot))
             for stamp, pose, sigma in zip(
                 path.stamps_ns.tolist(), path.poses.tolist(), sigmas, strict=True
             )

@@ -464,6 +464,13 @@ def test_scans_without_beams_are_dropped_and_counted(tmp_path):
 # ---------------------------------------------------------------- the process
 
 
+def made_of(cause, error=ImportError):
+    """As the extension of gtsam fails to be imported, and a class of Python 3.11 to be made."""
+    made = error("initialization failed")
+    made.__cause__ = cause
+    return made
+
+
 def fail_with(error):
     def smooth(*_arguments, **_more):
         raise error
@@ -475,6 +482,10 @@ def fail_with(error):
     ("error", "code", "text"),
     [
         (KeyboardInterrupt(), 130, r""),
+        (made_of(KeyboardInterrupt()), 130, r""),
+        (made_of(made_of(KeyboardInterrupt())), 130, r""),
+        (made_of(KeyboardInterrupt(), RuntimeError), 130, r""),
+        (made_of(OSError("bad library")), 1, r"unexpected ImportError: .*\n"),
         (OSError(errno.ENOSPC, "No space left on device", "x"), 1, r"x: No space left on device\n"),
         (RuntimeError("two\nlines"), 1, r"unexpected RuntimeError: two lines; .*--debug.*\n"),
     ],

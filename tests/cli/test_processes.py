@@ -110,6 +110,30 @@ def test_nothing_is_left_behind_after_a_signal(tmp_path, number):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("module", ["gtsam", "numpy"])
+def test_an_interrupt_while_a_library_is_imported_is_no_defect(log, tmp_path, module):
+    """A C extension makes an ImportError of it, which was reported as a defect."""
+    command = f"""
+import os, signal, sys
+from graphslam.cli import main
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "{module}":
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt as interrupt:
+                raise ImportError("initialization failed") from interrupt
+sys.meta_path.insert(0, Interrupting())
+main()
+"""
+    words = [sys.executable, "-c", command, "smooth", log, "-o", tmp_path / "out"]
+    done = subprocess.run(words, check=False, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("when", ["__enter__", "__exit__"])
 def test_a_signal_between_a_file_and_its_block_leaves_nothing(tmp_path, when):
     """A file was left when the signal came after its opening and before the block began."""

@@ -1,9 +1,11 @@
 """A recording that is estimated while it is written, and the folder of it."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import call
 from paths import LOGS
 from room_log import SCAN, S, drive
 
@@ -207,17 +209,139 @@ def test_a_clock_that_is_set_back_is_said(room, tmp_path):
     """What comes then is stamped an hour before what is estimated already."""
     messages = list(graphslam.open_logs(room).messages())
     half, hour = len(messages) // 2, 3600 * S
-    with LogWriter(tmp_path / "back.mcap") as log:
-        for k, m in enumerate(messages):
-            stamp = m.stamp_ns - hour * (k > half)
-            if isinstance(m, OdometryPose):
-                log.odometry(m.robot, stamp, m.pose, log_time_ns=m.time_ns)
-            elif isinstance(m, Scan):
-                log.scan(m.robot, stamp, m.ranges, log_time_ns=m.time_ns, **SCAN)
+    middle = messages[half].time_ns
+    rewritten(
+        tmp_path / "back.mcap", messages, stamps=lambda m: m.stamp_ns - hour * (m.time_ns > middle)
+    )
     summary = graphslam.follow(tmp_path / "back.mcap", tmp_path / "now")
     (said,) = (line for line in summary["warnings"] if "a clock was set back" in line)
     assert int(said.split()[0]) > 0.4 * half
+    (reason,) = (key for key in summary["dropped"] if key.startswith("stamp: older"))
+    assert "live.reorder_s" in reason  # logs.reorder_s is not used
     assert 0.4 < summary["live"]["estimates"] / summary["counts"]["scans"] <= 1.0
+
+
+def rewritten(path, messages, *, stamps=lambda m: m.stamp_ns, times=1):
+    """A log of messages, each recorded ``times``, when it was; ``stamps``: what is stamped."""
+    with LogWriter(path) as log:
+        for m in messages:
+            for _ in range(times):
+                if isinstance(m, OdometryPose):
+                    log.odometry(m.robot, stamps(m), m.pose, log_time_ns=m.time_ns)
+                elif isinstance(m, Scan):
+                    log.scan(m.robot, stamps(m), m.ranges, log_time_ns=m.time_ns, **SCAN)
+    return path
+
+
+def two_robots(room, path, late_s):
+    """The room, and another robot in it that begins ``late_s`` later."""
+    messages = list(graphslam.open_logs(room).messages())
+    begin = messages[0].time_ns
+    other = [replace(m, robot="other") for m in messages if m.time_ns > begin + late_s * S]
+    return rewritten(path, sorted([*messages, *other], key=lambda m: m.time_ns))
+
+
+def test_what_begins_too_late_to_be_followed_is_said_at_once_and_counted(
+    room, tmp_path, monkeypatch
+):
+    """A robot was ignored without a word. What is followed is estimated as without it."""
+    both = two_robots(room, tmp_path / "both.mcap", 15)
+    recorder = Recorder(both, tmp_path / "now.mcap", monkeypatch)
+    said, seen = [], []
+    told = graphslam.follow(
+        recorder.path,
+        tmp_path / "out",
+        each=seen.append,
+        warn=lambda text: said.append((len(seen), text)),
+    )
+    assert {e.robot for e in seen} == {"robot"} and len(seen) == 61
+    ((when, first),) = said
+    assert 20 < when < 45  # when it begins, not at the end
+    assert "/other/odom, /other/scan: began later than what is followed" in first
+    assert "`graphslam smooth` of the recording uses them" in first
+    counts = {key: n for key, n in told["dropped"].items() if "began later" in key}
+    assert {key.partition(":")[0] for key in counts} == {"/other/odom", "/other/scan"}
+    assert sum(counts.values()) == 150 + 31
+    (last,) = (line for line in told["warnings"] if "began later" in line)
+    assert "181 messages so far are left out" in last
+
+
+def test_the_command_says_at_once_what_it_does_not_follow(room, tmp_path, monkeypatch):
+    """On stderr, without --verbose; and again in the end, with what was dropped."""
+    both = two_robots(room, tmp_path / "both.mcap", 15)
+    recorder = Recorder(both, tmp_path / "now.mcap", monkeypatch)
+    done = call("follow", recorder.path, "-o", tmp_path / "out")
+    assert done.code == 0
+    assert done.err.startswith("graphslam: warning: /other/odom, /other/scan: began later than")
+    assert done.err.count("\n") == 1
+    assert "warning: /other/odom, /other/scan: began later than what is followed" in done.out
+    assert "dropped: 31 x /other/scan: began later than what is followed" in done.out
+
+
+def test_a_robot_whose_start_is_given_is_waited_for(room, tmp_path, monkeypatch):
+    """Up to live.wait_s; it was refused unless it came in the first two seconds."""
+    both = two_robots(room, tmp_path / "both.mcap", 8)
+    recorder = Recorder(both, tmp_path / "now.mcap", monkeypatch, pieces=60)
+    starts = {"start.poses.robot": [0.0, 0.0, 0.0], "start.poses.other": [1.0, 0.0, 0.0]}
+    told = graphslam.follow(recorder.path, tmp_path / "out", **{"live.wait_s": 30.0}, **starts)
+    assert told["frames"] == {"other": "other", "robot": "other"}  # one frame for both
+    assert not any("began later" in text for text in (*told["dropped"], *told["warnings"]))
+    robots = graphslam.load_result(tmp_path / "out").robots
+    assert {name: len(robot.final) > 40 for name, robot in robots.items()} == {
+        "other": True,
+        "robot": True,
+    }
+
+
+def test_a_robot_that_never_comes_is_not_waited_for_without_end(room, tmp_path, monkeypatch):
+    """The line names it, and those that are there."""
+    recorder = Recorder(room, tmp_path / "now.mcap", monkeypatch, pieces=300)
+    with pytest.raises(graphslam.LogError, match=r"nothing usable of ben .*30 s, only of robot;"):
+        graphslam.follow(
+            recorder.path,
+            tmp_path / "out",
+            **{"live.wait_s": 30.0, "start.poses.ben": [0.0, 0.0, 0.0]},
+        )
+    assert 60 < recorder.piece < 120  # of half a second each
+
+
+def test_messages_that_were_recorded_twice_give_one_pose(room, tmp_path):
+    """Two poses of one stamp were written. Poses are those of the recording without them."""
+    messages = list(graphslam.open_logs(room).messages())
+    once = graphslam.follow(rewritten(tmp_path / "once.mcap", messages), tmp_path / "a")
+    told = graphslam.follow(rewritten(tmp_path / "twice.mcap", messages, times=2), tmp_path / "b")
+    assert told["live"]["estimates"] == once["live"]["estimates"] == 61
+    repeated = {"scan: stamp repeated": 61, "odometrypose: recorded twice": 301}
+    assert told["dropped"] == once["dropped"] | repeated
+    a, b = (graphslam.load_result(tmp_path / name).robots["robot"].final for name in "ab")
+    assert np.all(np.diff(b.stamps_ns) > 0)
+    np.testing.assert_array_equal(a.poses, b.poses)
+
+
+def test_a_clock_that_is_set_back_by_a_second_is_said(room, tmp_path):
+    """The motion of some of that second is lost: four readings of ten a second, too few to be said
+    for their number. Breaks also if the stamps that come again give a second pose each."""
+    messages = list(graphslam.open_logs(room).messages())
+    middle = messages[len(messages) // 2].time_ns
+    path = rewritten(
+        tmp_path / "back.mcap", messages, stamps=lambda m: m.stamp_ns - S * (m.time_ns > middle)
+    )
+    told = graphslam.follow(path, tmp_path / "out")
+    (said,) = (line for line in told["warnings"] if "a clock was set back" in line)
+    assert said.startswith("4 messages were left out")
+    final = graphslam.load_result(tmp_path / "out").robots["robot"].final
+    assert np.all(np.diff(final.stamps_ns) > 0)
+
+
+def test_single_late_messages_are_counted_and_are_no_warning(room, tmp_path):
+    """Of a bus under load; a pose of odometry that is missing does no harm."""
+    messages = list(graphslam.open_logs(room).messages())
+    late = {id(m) for m in [m for m in messages if isinstance(m, OdometryPose)][20:-20:40]}
+    moved = [replace(m, time_ns=m.time_ns + S) if id(m) in late else m for m in messages]
+    path = rewritten(tmp_path / "late.mcap", sorted(moved, key=lambda m: m.time_ns))
+    told = graphslam.follow(path, tmp_path / "out")
+    assert told["dropped"]["stamp: older than live.reorder_s allows"] == len(late)
+    assert not any("a clock was set back" in line for line in told["warnings"])
 
 
 def test_what_is_lost_is_said(room, tmp_path):
@@ -232,6 +356,13 @@ def test_what_is_lost_is_said(room, tmp_path):
     assert file["lost"] == known.files[0].lost > 0
     assert (file["messages"], file["sha256"]) == (known.files[0].messages, known.files[0].sha256)
     assert any("messages are lost" in warning for warning in told["warnings"])
+
+
+def test_a_followed_recording_is_no_map_yet_and_says_so(room, tmp_path):
+    """It has no joint covariance of its landmarks; it is not of another version."""
+    graphslam.follow(room, tmp_path / "live")
+    with pytest.raises(graphslam.OutputError, match=r"live: is of `graphslam follow`.* smooth "):
+        graphslam.smooth(room, **{"known_map.directory": str(tmp_path / "live")})
 
 
 @pytest.mark.parametrize(("start", "astray"), [([0.0, 0.0, 0.0], False), ([3.0, 2.5, 2.0], True)])

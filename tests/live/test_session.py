@@ -9,7 +9,7 @@ from room_log import MOUNT, SCAN, START_NS, drive, true_pose
 
 import graphslam
 from graphslam.core.geometry import between, compose
-from graphslam.core.records import Closure, OdometryPose, Scan, Sighting, WheelAngles
+from graphslam.core.records import Closure, OdometryPose, Scan, Sighting, Truth, WheelAngles
 from graphslam.live import live_pass
 from graphslam.logs import LogWriter
 
@@ -239,7 +239,7 @@ def test_messages_that_are_late_are_sorted_in(room, live):
     np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in live[1]])
     session = graphslam.Session(live={"horizon_s": HORIZON_S, "reorder_s": 0.2})
     assert len(list(session.process(late))) < 0.2 * len(found)
-    assert session.dropped["stamp: older than logs.reorder_s allows"] > 0.8 * len(found)
+    assert session.dropped["stamp: older than live.reorder_s allows"] > 0.8 * len(found)
 
 
 def test_what_is_left_out_is_counted_while_it_happens(room):
@@ -363,6 +363,55 @@ def test_robots_that_are_no_records_are_refused(robots):
         graphslam.Session(robots=robots)
 
 
+@pytest.mark.parametrize("off_ns", [3600 * S, -3600 * S, None], ids=["ahead", "behind", "zero"])
+@pytest.mark.parametrize("place", [0, 1, 3])
+def test_a_wrong_stamp_at_the_beginning_is_left_out_and_counted(room, off_ns, place):
+    """Breaks if robots and sensors are found out before it is: an hour ahead, the introduction
+    never ended; at 0, it ended at once, with nothing to estimate from. The rest is as without."""
+    few = room[1][:200]
+    wrong_ns = 0 if off_ns is None else few[place].time_ns + off_ns
+    bad = replace(few[place], stamp_ns=wrong_ns, time_ns=wrong_ns)
+    taken = []
+
+    def queue():
+        for message in [*few[:place], bad, *few[place + 1 :]]:
+            taken.append(message)
+            yield message
+
+    session, at_first = graphslam.Session(), []
+    found = []
+    for estimate in session.process(queue()):
+        at_first = at_first or [len(taken)]
+        found.append(estimate)
+    without = graphslam.Session()
+    left = list(without.process(few[:place] + few[place + 1 :]))
+    assert at_first[0] < 60  # it does not wait for the end: 20 readings and 4 scans in 2 s
+    (reason,) = +(session.dropped - without.dropped)
+    assert reason.startswith("stamp: far") and session.dropped[reason] == 1
+    np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in left])
+
+
+def test_a_clock_that_is_set_in_the_beginning_does_not_end_it(room):
+    """Eight messages since 1970: time did go on, and the two seconds begin anew."""
+    few = room[1][:300]
+    early = [replace(m, stamp_ns=m.stamp_ns - few[0].stamp_ns, time_ns=m.time_ns - few[0].time_ns)
+             for m in few if isinstance(m, OdometryPose)][:8]  # fmt: skip
+    found = list(graphslam.Session().process([*early, *few[8:]]))
+    assert len(found) > 40
+
+
+def test_the_truth_may_have_a_clock_of_its_own(room):
+    """It is not used, so that its stamps say nothing of those of the others."""
+    few = room[1][:200]
+    true = [Truth("robot", k, k, np.zeros(3)) for k in range(len(few))]
+    mixed = [m for pair in zip(true, few, strict=True) for m in pair]
+    session = graphslam.Session()
+    found = list(session.process(mixed))
+    assert not +session.dropped
+    left = list(graphslam.Session().process(few))
+    np.testing.assert_array_equal([e.pose for e in found], [e.pose for e in left])
+
+
 def test_time_may_go_on_after_a_pause():
     """Nothing for a minute, and then everything as before: no stamp is taken for wrong."""
     messages = list(sightings())
@@ -409,9 +458,14 @@ def test_what_nobody_announced_is_left_out(room):
     session = graphslam.Session()
     assert {e.robot for e in session.process([*room[1][:300], *stranger])} == {"robot"}
     assert sum(session.dropped.values()) == 50
+    whose = "late did not send any in the first 2 s"
+    assert set(session.dropped) == {f"{what}: {whose}" for what in ("odometrypose", "scan")}
     session = graphslam.Session(robots={"robot": (OdometryPose, Scan)})
-    assert {e.robot for e in session.process(room[1][:300])} == {"robot"}
+    found = session.process([*room[1][:300], *stranger])
+    assert {e.robot for e in found} == {"robot"}
     assert session.robots == ("robot",)
+    whose = "late was not to send any, by Session(robots=...)"
+    assert set(session.dropped) == {f"{what}: {whose}" for what in ("odometrypose", "scan")}
 
 
 @pytest.mark.parametrize(

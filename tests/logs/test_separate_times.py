@@ -31,7 +31,9 @@ def test_two_robots_whose_topics_have_the_same_names_are_refused(tmp_path):
     """As one robot their scans would alternate, and the result would be good for nothing. What is
     said names both recordings and what to do, and doing it works."""
     paths = [record(tmp_path / "anna.mcap", 0, 30), record(tmp_path / "ben.mcap", 10, 40, speed=1)]
-    with pytest.raises(LogError, match=r"anna\.mcap and .*ben\.mcap: .*same 20 s.*--same-place"):
+    # compare and info have no such option: they say so of smooth, and what they can do
+    told = r"anna\.mcap and .*ben\.mcap: .*same 20 s.*smooth --same-place .*compare: --each"
+    with pytest.raises(LogError, match=told):
         open_logs(paths, graphslam.load_config())
     assert "--same-place" in inspect_logs(paths, graphslam.load_config()).problem
     apart = open_logs(paths, graphslam.load_config(**{"logs.same_place": True}))

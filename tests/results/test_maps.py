@@ -330,6 +330,18 @@ def test_robots_that_nothing_places_are_in_no_map(saved, tmp_path):
     assert (tmp_path / "out/trajectories.csv").read_text().count("\nrobot,") == 60
 
 
+def test_a_table_of_poses_says_in_which_frame_they_are(saved, tmp_path):
+    """As landmarks.csv does. Drawn from the table alone, two frames would look like one world."""
+    _, result = saved
+    robots = dict.fromkeys(("robot", "other"), result.robots["robot"])
+    summary = {**result.summary, "world": "robot", "frames": {"robot": "robot", "other": "other"}}
+    save(replace(result, robots=robots, summary=summary), tmp_path / "out", force=False)
+    make_map(tmp_path / "out", tmp_path / "out")
+    rows = list(csv.DictReader((tmp_path / "out/trajectories.csv").read_text().splitlines()))
+    assert list(rows[0])[-1] == "frame"  # columns are only added, at the end
+    assert {(row["robot"], row["frame"]) for row in rows} == {("robot", ""), ("other", "other")}
+
+
 def test_a_resolution_is_kept_and_a_result_without_its_scans_says_so(saved, tmp_path):
     folder, _ = saved
     made = make_map(folder, tmp_path / "a", resolution_m=0.2)
