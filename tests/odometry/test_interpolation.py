@@ -223,10 +223,10 @@ def test_no_correction_happens_while_the_robot_stands():
 
 
 def test_a_late_robot_is_corrected_when_its_sensor_sees_it_drive():
-    """It drives from 2 to 3 s by its odometry and stands else; its sensor, 0.4 s late, sees that from
-    2.4 to 3.4 s. Before and after, the poses are those of the states, and halfway half of the
-    correction is done: by the odometry's own times 0.4 of it would be done 0.4 s too early. 1e-9:
-    stamps are whole nanoseconds, a few roundings."""
+    """By its odometry it drives from 2 to 3 s and stands else; its sensor, 0.4 s late, sees that
+    from 2.4 to 3.4 s. Before and after, the poses are those of the states, and halfway half of the
+    correction is done. By the odometry's times it would begin while the robot stands. 1e-9: stamps
+    are whole nanoseconds, a few roundings."""
     times = [0, 2, 3, 8]
     track = odometry_track(times, [[0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]], mounted=True)
     track.calibration = replace(track.calibration, mean=np.array([0, 0, 0, 0, 0, 0, 0.4]))
