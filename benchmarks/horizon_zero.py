@@ -16,7 +16,7 @@ Run: python benchmarks/horizon_zero.py [lab corridor two-robots forest intel] [-
 
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,8 +82,18 @@ def cpu_ms(steps: Sequence[Step], config: Config) -> float:
     return 1e3 * (time.process_time() - began) / len(steps)
 
 
-def isam2_filter(steps: Sequence[Step]) -> dict[int, Array]:
-    """The filter inside ISAM2: every state's pose (3,) as its own step left it, by its key.
+def jacobian_factor(A: Array, b: Array, dims: Mapping[int, int]) -> gtsam.JacobianFactor:
+    """Whitened rows A (k, D) z = b (k,) of one or two variables with their dimensions, in order."""
+    unit = gtsam.noiseModel.Unit.Create(len(b))
+    first, *second = dims
+    dim = dims[first]
+    if not second:
+        return gtsam.JacobianFactor(first, A, b, unit)
+    return gtsam.JacobianFactor(first, A[:, :dim], second[0], A[:, dim:], b, unit)
+
+
+def isam2_filter(steps: Sequence[Step]) -> dict[str, list[Array]]:
+    """The filter inside ISAM2: every state's pose (3,) as its own step left it, of each robot.
 
     A factor moves all variables, and the next one is linearised where they are then: so the
     corrections of the whole tree are read after every factor.
@@ -97,7 +107,7 @@ def isam2_filter(steps: Sequence[Step]) -> dict[int, Array]:
     values: dict[int, Array] = {}
     first: dict[int, Array] = {}  # where ISAM2 linearises: at a variable's first value
     z: dict[int, Array] = {}
-    causal = {}
+    causal: dict[str, list[Array]] = {}
     for step in steps:
         for group in builder.factor_groups(step, lambda key, _dim: values[key]):
             new = gtsam.Values()
@@ -111,7 +121,7 @@ def isam2_filter(steps: Sequence[Step]) -> dict[int, Array]:
                 rows, at = linear(factor, values, z.__getitem__), gtsam.Values()
                 for key in rows.dims:
                     factors.write(at, key, first[key])
-                made = factors.jacobian_factor(rows.A, rows.b, rows.dims)
+                made = jacobian_factor(rows.A, rows.b, rows.dims)
                 graph.add(gtsam.LinearContainerFactor(made, at))
             tree.update(graph, new)
             if group.new is None:  # else nothing moves
@@ -121,8 +131,7 @@ def isam2_filter(steps: Sequence[Step]) -> dict[int, Array]:
                 correct(values, {key: (now[key] - z[key])[:, None] for key in z})
                 z = now
         for robot in {**step.starts, **step.motions}:
-            key = builder.latest_key(robot)
-            causal[key] = values[key].copy()
+            causal.setdefault(robot, []).append(values[builder.latest_key(robot)].copy())
     return causal
 
 
@@ -132,12 +141,8 @@ def isam2_row(name: str, steps: Sequence[Step]) -> str:
     began = time.process_time()
     inside = isam2_filter(steps)
     ms = 1e3 * (time.process_time() - began) / len(steps)
-    ours = FactorEkfBackend(config)
-    for step in steps:
-        ours.add(step)
-    worst = 0.0
-    for key, (mean, cov) in ours.causal_states.items():
-        worst = max(worst, apart(mean[None], cov[None], inside[key][None], cov[None]).mean)
+    ours = replay(steps, FactorEkfBackend(config)).causal
+    worst = max(apart(a.poses, a.covs, np.array(inside[n]), a.covs).mean for n, a in ours.items())
     return f"| {name} | {len(steps)} | {worst:.1e} | {cpu_ms(steps, config):.2f} | {ms:.2f} |"
 
 

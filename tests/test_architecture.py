@@ -319,6 +319,31 @@ def test_names_in_docstrings_and_comments_exist():
     assert not wrong, "\n".join(wrong)
 
 
+def defined_in(path):
+    """Names that a module defines itself, those that it imports left out."""
+    names = set()
+    for node in tree_of(path).body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            names.add(node.name)
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names |= {n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)}
+    return names
+
+
+def test_full_names_in_docstrings_are_those_of_where_something_is_defined():
+    """`graphslam.room.module.name` leads to the definition, not to a module that imports it. What
+    `__init__` offers is taken as it is."""
+    wrong = []
+    for path in FILES:
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            for room, module, name in re.findall(r"`graphslam\.(\w+)\.(\w+)\.(\w+)", line):
+                file = ROOT / room / f"{module}.py"
+                if not file.exists() or name not in defined_in(file):
+                    wrong.append(f"{place(path, number)} {room}.{module}.{name}")
+    assert not wrong, "\n".join(wrong)
+
+
 # ------------------------------------------------------------ below the command line
 
 

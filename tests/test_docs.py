@@ -153,6 +153,17 @@ def test_what_a_page_names_is_there(page):
     assert not wrong, f"{page.name}: {', '.join(wrong)}"
 
 
+def test_the_path_of_a_scan_names_modules_and_what_is_in_them():
+    """Each line of the tree of calls: a file, and a function or class that it defines."""
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    tree = re.search(r"^## The path of a scan.*?^```\n(.*?)^```", text, flags=re.M | re.S)[1]
+    lines = [re.match(r" *([\w/]+\.py): (\w+) ", line) for line in tree.splitlines()]
+    assert len(lines) > 30 and all(lines)
+    for path, name in (line.groups() for line in lines):
+        body = ast.parse((ROOT / "graphslam" / path).read_text(encoding="utf-8")).body
+        assert name in {getattr(node, "name", "") for node in body}, f"{path}: {name}"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_keys_of_the_summary_are_not_modules(page):
     """What a page says is "in summary.json", or that it "has", is a key of docs/formats.md."""

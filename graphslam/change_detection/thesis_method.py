@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import label
-from scipy.spatial import cKDTree
 
 from graphslam.change_detection.grid import Grid
 from graphslam.change_detection.visit import Bools, Ints
@@ -284,16 +283,3 @@ def consecutive_runs(marked: Bools, least: int) -> Bools:
     """Which of ``marked`` (n,) are in a run of at least ``least`` marked ones (5.3)."""
     run, _ = label(marked)
     return np.asarray(marked & (np.bincount(run)[run] >= least))
-
-
-def stable_points(points: Array, others: list[Array], within_m: float, least: int) -> Bools:
-    """Which points (n, 2) m lie near some point of at least ``least`` of the ``others`` (k, 2).
-
-    Rule of 5.3: points must be stable over time before they enter the map or the comparison.
-    """
-    usable = np.isfinite(points).all(axis=1)
-    trees = [cKDTree(other[np.isfinite(other).all(axis=1)]) for other in others]
-    away = [tree.query(points[usable], distance_upper_bound=within_m)[0] for tree in trees]
-    stable = np.zeros(len(points), dtype=bool)
-    stable[usable] = np.isfinite(away).sum(axis=0) >= least
-    return stable

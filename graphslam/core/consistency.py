@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from graphslam.core.errors import EstimationError
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, transform, wrap
 
@@ -71,11 +72,19 @@ def leave_one_out(chosen: IntArray, r: Array, S: Array, probability: float) -> l
         r: (n, 3) innovations.
         S: (3n, 3n) their joint covariance.
         probability: of the chi-square limit (3 degrees of freedom).
+
+    Raises:
+        EstimationError: an innovation or a covariance is not a number, so nothing can be compared.
     """
     members, gate = [int(k) for k in chosen], chi2_quantile(probability, 3)
     while len(members) > 1:
         rows = np.concatenate([np.arange(3 * k, 3 * k + 3) for k in members])
         d2 = leave_one_out_distances(np.linalg.inv(S[np.ix_(rows, rows)]), r[members])
+        if np.isnan(d2).any():
+            raise EstimationError(
+                f"{len(members)} measurements cannot be compared with each other: innovations or "
+                "covariances of the estimate are not numbers; it has diverged"
+            )
         if d2.max() <= gate:
             break
         members = [k for k, bad in zip(members, d2 == d2.max(), strict=True) if not bad]

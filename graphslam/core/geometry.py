@@ -225,13 +225,18 @@ def compose_cov(a: Array, cov_a: Array, b: Array, cov_b: Array) -> Array:
 
 
 def inverse_cov(a: Array, cov_a: Array) -> Array:
-    """Covariance (..., 3, 3) of ``inverse(a)``, along the axes of frame a.
+    """Covariance (..., 3, 3) of ``inverse(a)``, along the axes of frame a."""
+    K = inverse_jacobian(a)
+    return np.asarray(K @ cov_a @ K.mT)
 
-    From ``compose(a, inverse(a)) = 0``: F da + W d(inverse) = 0.
+
+def inverse_jacobian(a: Array) -> Array:
+    """Derivative (..., 3, 3) of ``inverse(a)`` by a, additive errors (x m, y m, phi rad).
+
+    From ``compose(a, inverse(a)) = 0``: F da + W d(inverse) = 0, and W is a rotation.
     """
     F, W = compose_jacobians(a, inverse(a))
-    K = W.mT @ F
-    return np.asarray(K @ cov_a @ K.mT)
+    return np.asarray(-W.mT @ F)
 
 
 def rotate_cov(cov: Array, angle_rad: ArrayLike) -> Array:

@@ -135,11 +135,6 @@ class FactorEkfBackend(GraphBackend):
         self._causal: dict[int, tuple[Array, Array]] = {}  # states after their own step
         self._error = 0.0
 
-    @property
-    def causal_states(self) -> dict[int, tuple[Array, Array]]:
-        """Key of every state -> its pose (3,) and covariance (3, 3) after its own step."""
-        return self._causal
-
     def value(self, key: int, dim: int) -> Array:
         """See `GraphBackend`."""
         return self._values[key]

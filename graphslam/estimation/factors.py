@@ -390,16 +390,6 @@ def linearised(
     return A, -R @ model.residual(z, x, t)
 
 
-def jacobian_factor(A: Array, b: Array, dims: Mapping[int, int]) -> gtsam.JacobianFactor:
-    """Whitened rows A (k, D) z = b (k,) of one or two variables with their dimensions, in order."""
-    unit = gtsam.noiseModel.Unit.Create(len(b))
-    first, *second = dims
-    dim = dims[first]
-    if not second:
-        return gtsam.JacobianFactor(first, A, b, unit)
-    return gtsam.JacobianFactor(first, A[:, :dim], second[0], A[:, dim:], b, unit)
-
-
 def known_landmark_factor(
     numbers: Sequence[int], row: Array, means: Mapping[int, Array]
 ) -> gtsam.NonlinearFactor:

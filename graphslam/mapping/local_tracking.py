@@ -105,6 +105,10 @@ class LocalTracker:
         """Pose (3,) of the robot in the frame of the latest anchor, and its covariance (3, 3)."""
         return self._filter.reference(ANCHOR)
 
+    def _present_pose(self) -> Array:
+        """Pose (3,) of the filter's frame, the robot's after its latest motion, in the world."""
+        return compose(self._anchor_pose, self._filter.reference(ANCHOR)[0])
+
     def move(self, motion: Motion) -> None:
         """The robot moved; must be followed by `track` before the next motion."""
         self._filter.predict(motion.delta, motion.cov)
@@ -130,7 +134,7 @@ class LocalTracker:
         self._update(pairs, chosen)
         moved, cov = self._filter.reference(PREVIOUS)
         # not step by step: what a step leaves of an error is corrected with the next images
-        self.pose = compose(self._anchor_pose, self._filter.reference(ANCHOR)[0])
+        self.pose = self._present_pose()
         used = dict(zip(pairs.observation[chosen].tolist(), chosen.tolist(), strict=True))
         return self._record(image, pairs, used), moved, cov
 
@@ -302,7 +306,8 @@ class LocalTracker:
 
     def _retire(self, old: BoolArray) -> None:
         """Take rows ``old`` (n,) out; those of the graph become entries of the map."""
-        table = self._table
+        # the filter may have moved since `pose` was set: its landmarks are seen from where it is
+        table, pose = self._table, self._present_pose()
         for row in np.flatnonzero(old).tolist():
             number = int(table.id[row])
             first_ns = self._first_ns.pop(number)
@@ -313,7 +318,7 @@ class LocalTracker:
             self.entries[number] = Entry(
                 number,
                 KINDS[table.kind[row]],
-                compose(self.pose, self._filter.landmarks[row]),
+                compose(pose, self._filter.landmarks[row]),
                 np.zeros((3, 3)),
                 table.extent[row].copy(),
                 first_ns,

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
+from graphslam.core.errors import EstimationError
 from graphslam.core.gaussian import symmetric
 from graphslam.core.geometry import (
     Array,
@@ -75,7 +76,8 @@ class SubmapGraph:
     """``poses`` (n, 3) of submaps, by relative poses between consecutive ones and closures.
 
     It may be solved for the beginnings of the paths only: what follows hangs from them, and says
-    nothing about them.
+    nothing about them. Of submaps that are not in use nothing is known but where they were put:
+    closures with them and their covariances are refused, with an EstimationError.
     """
 
     def __init__(
@@ -116,6 +118,8 @@ class SubmapGraph:
 
     def solve(self, closures: SubmapConstraints | None = None) -> None:
         """Solve with these closures, beginning where the poses are."""
+        if closures is not None:
+            self._require_used(np.concatenate([closures.begin, closures.end]))
         self._closures = closures
         edges, information = self._measured()
         factor = self._factorised(edges, information)
@@ -138,6 +142,7 @@ class SubmapGraph:
 
     def covariance(self, which: IntArray) -> Array:
         """Joint covariance (3k, 3k) of submaps (k,), errors along each pose's own axes."""
+        self._require_used(which)
         return symmetric(self._columns(which)[self._rows(which)])
 
     def relative(self, i: IntArray, j: IntArray) -> tuple[Array, Array]:
@@ -146,8 +151,9 @@ class SubmapGraph:
         Columns of the inverse are computed `COLUMNS` submaps at a time, so memory grows with the
         path only.
         """
-        h = between(self.poses[j], self.poses[i])
         nodes = np.unique(np.concatenate([i, j]))
+        self._require_used(nodes)
+        h = between(self.poses[j], self.poses[i])
         own = np.zeros((len(self.poses), 3, 3))
         cross = np.zeros((len(i), 3, 3))
         for first in range(0, len(nodes), COLUMNS):
@@ -161,6 +167,15 @@ class SubmapGraph:
         H = relative_jacobian(h)
         both = np.block([[own[j], cross], [cross.mT, own[i]]])
         return h, H @ both @ H.mT
+
+    def _require_used(self, which: IntArray) -> None:
+        """Raise EstimationError if one of some submaps (k,) is not in use: it has no rows."""
+        unused = np.unique(which[~self._used[which]])
+        if len(unused):
+            raise EstimationError(
+                f"submaps {', '.join(map(str, unused[:5]))}: are not in use yet, their path is "
+                "solved up to an earlier one; SubmapGraph.begin_with says how far"
+            )
 
     def _rows(self, which: IntArray) -> IntArray:
         """Rows (3k,) of submaps (k,) in the normal equations."""

@@ -1,9 +1,9 @@
 """Detection of robots in each other's scans, where the joint estimate expects them.
 
 A detection becomes a `Sighting`, like one of a camera. Its returns are removed from the scan, so
-that they create no landmark. A cluster is accepted as the robot if it has the outline's shape and
-is the only one within the gate of the expected pose. Returns of unknown dynamic objects are removed
-too. Robots of unknown start are detected by `mutual_detection`.
+that they create no landmark. A cluster is accepted as the robot if it has the outline's shape, is
+the only one within the gate of the expected pose, and cannot be another robot as well. Returns of
+unknown dynamic objects are removed too. Robots of unknown start are detected by `mutual_detection`.
 """
 
 from collections import Counter, defaultdict, deque
@@ -134,23 +134,53 @@ def detect_robots(
     """
     sweep = make_sweep(scan, config.max_range_m)
     gone = np.zeros(len(sweep.beam), dtype=np.bool_)
-    sightings = []
+    found: dict[str, list[_Candidate]] = {}
     for name, expected in robots.items():
         pose = between(scan.mount, expected.pose)
         cov = rotate_cov(expected.cov, -float(scan.mount[2]))
         fits = _fit_clusters(sweep, outlines[name], pose, cov, config, without_robot.get(name, ()))
-        d2 = [distance2 for distance2, _ in fits]
-        if len(fits) == 1 or (fits and d2[1] > d2[0] + RIVAL_D2):
-            sightings.append(_sighting(scan, name, fits[0][1]))
-        poses = [fit.pose for _, fit in fits]
+        found[name] = fits
+        poses = [one.fit.pose for one in fits]
         if not fits and np.sqrt(np.linalg.eigvalsh(cov[:2, :2])[-1]) < MAX_POSITION_SIGMA_M:
             poses = [pose]
         for at in poses:
             radius_m = outline_radius(outlines[name]) + MARGIN_M
             gone |= np.hypot(*(sweep.points - at[:2]).T) < radius_m
+    sightings = [
+        _sighting(scan, name, found[name][0].fit) for name in found if _is_seen(name, found)
+    ]
     if not gone.any():
         return DetectedRobots(scan, tuple(sightings))
     return DetectedRobots(without_returns(scan, sweep, gone), tuple(sightings))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A cluster that may be a robot: ``cluster`` is its number in the scan, ``fit`` of the outline.
+
+    ``d2``: squared distance from the expected pose. ``cost``: minus twice the logarithm of how
+    likely the cluster's returns are if it is this robot, to compare robots by: that of the outline
+    at the best pose, times the share of the expected poses that this fit leaves (Laplace).
+    """
+
+    cluster: int
+    fit: OutlineFit
+    d2: float
+    cost: float
+
+
+def _is_seen(name: str, found: Mapping[str, Sequence[_Candidate]]) -> bool:
+    """Whether the first candidate of a robot is the robot: no other cluster, and no other robot.
+
+    One of two robots that a cluster may be is hidden or beside its place, and nothing tells which.
+    """
+    if not found[name]:
+        return False
+    best, *others = found[name]
+    if others and others[0].d2 <= best.d2 + RIVAL_D2:
+        return False
+    rivals = (one for other, fits in found.items() if other != name for one in fits)
+    return all(r.cluster != best.cluster or r.cost > best.cost + RIVAL_D2 for r in rivals)
 
 
 def _fit_clusters(
@@ -160,8 +190,8 @@ def _fit_clusters(
     cov: Array,
     config: FrontEndConfig,
     without_robot: Sequence[View],
-) -> list[tuple[float, OutlineFit]]:
-    """Squared distance from the expected pose, and fit, of clusters in the gate; nearest first."""
+) -> list[_Candidate]:
+    """Clusters in the gate of the expected pose ``pose`` (3,), ``cov`` (3, 3); nearest first."""
     size = 2 * outline_radius(outline)
     found = free_standing_clusters(sweep, size + MARGIN_M)
     near = np.hypot(*(cluster_centres(sweep, found) - pose[:2]).T) if len(found) else np.zeros(0)
@@ -178,13 +208,15 @@ def _fit_clusters(
         n = 3 if fit.heading_found else 2
         off = fit.pose - pose
         off[2] = wrap(off[2])
-        S = cov[:n, :n] + fit.cov[:n, :n] + MODEL_SIGMA_M**2 * np.eye(n)
+        P = fit.cov[:n, :n] + MODEL_SIGMA_M**2 * np.eye(n)
+        S = cov[:n, :n] + P
         d2 = float(mahalanobis_squared(off[:n], S))
         points = sweep.points[span[0] : span[1] + 1]
         stood = any(was_present(points, before, here) for before, here in without_robot)
         if d2 < chi2_quantile(GATE_PROBABILITY, n) and not stood:
-            fits.append((d2, fit))
-    return sorted(fits, key=lambda one: one[0])
+            wider = np.linalg.slogdet(S)[1] - np.linalg.slogdet(P)[1]
+            fits.append(_Candidate(int(k), fit, d2, fit.chi2 + d2 + float(wider)))
+    return sorted(fits, key=lambda one: one.d2)
 
 
 def _sighting(scan: Scan, name: str, fit: OutlineFit) -> Sighting:

@@ -125,9 +125,12 @@ class _Interval:
         slip = _slips(moved, whole, whole_noise)
         whole, whole_noise, slip = whole[of], whole_noise[of], slip[of]
         inside = following > i
-        effort = track.effort(at)
+        # as the motions are, by the odometry's clock: states may be late against it
+        late_ns = track.latency_ns
+        effort = track.effort(at - late_ns)
         driven = np.where(inside, effort[following] - effort[i], 0.0)
-        share = (track.effort(times_ns) - effort[i]) / np.where(driven > 0, driven, 1.0)
+        since = track.effort(times_ns - late_ns) - effort[i]
+        share = since / np.where(driven > 0, driven, 1.0)
         # most of the motion was not seen, and may have been while odometry stood
         unseen = np.hypot(slip[:, 0], slip[:, 1]) + np.abs(slip[:, 2]) > driven
         passed = (times_ns - at[i]) / np.maximum(at[following] - at[i], 1)

@@ -17,6 +17,7 @@ from graphslam.core.geometry import (
     compose,
     inverse,
     inverse_cov,
+    inverse_jacobian,
     wrap,
 )
 from graphslam.core.motion_models import (
@@ -256,7 +257,8 @@ class Track(Readings):
             return self.motion(start_ns, end_ns)
         forth = self.motion(end_ns, start_ns)
         cov = inverse_cov(forth.delta, forth.cov)
-        return replace(forth, start_ns=start_ns, end_ns=end_ns, delta=inverse(forth.delta), cov=cov)
+        d_cal = inverse_jacobian(forth.delta) @ forth.d_delta_d_calibration
+        return Motion(start_ns, end_ns, inverse(forth.delta), cov, d_cal, forth.length_m)
 
     def motions(self, start_ns: IntArray, end_ns: IntArray) -> Motions:
         """What `between` gives, for times (n,) and (n,), at once; see `preintegrate_batch`."""
@@ -401,6 +403,7 @@ class _SumsAtStates:
         back = end < start
         if back.any():
             cov[back] = inverse_cov(delta[back], cov[back])
+            d_cal[back] = inverse_jacobian(delta[back]) @ d_cal[back]
             delta[back] = inverse(delta[back])
         return Motions(delta, cov, d_cal, length)
 

@@ -19,6 +19,7 @@ from graphslam.core.geometry import (
     compose_jacobians,
     inverse,
     inverse_cov,
+    inverse_jacobian,
     rotation3,
     wrap,
 )
@@ -138,7 +139,7 @@ class SeveralLasersTrack(Track):
         back = end < begin
         if back.any():
             cov[back] = inverse_cov(delta[back], cov[back])
-            d_cal[back] = _inverse_jacobian(delta[back]) @ d_cal[back]
+            d_cal[back] = inverse_jacobian(delta[back]) @ d_cal[back]
             delta[back] = inverse(delta[back])
         step = 0.0 if self.has_burst_stamps else 1e9 / LATENCY_STEP_NS
         by_start = _change(between(earlier[a], sums.pose[b]), delta) * step
@@ -201,9 +202,3 @@ def _change(moved: Array, delta: Array) -> Array:
     change = moved - delta
     change[:, 2] = wrap(change[:, 2])
     return np.asarray(change)
-
-
-def _inverse_jacobian(a: Array) -> Array:
-    """Derivative (n, 3, 3) of ``inverse(a)`` by a."""
-    F, W = compose_jacobians(a, inverse(a))
-    return np.asarray(-W.mT @ F)

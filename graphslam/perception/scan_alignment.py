@@ -166,7 +166,7 @@ def align_scan(
     reach_m = scans.config.reach_m
     best = one.from_start(guess, guess, PREDICTED_REACH * reach_m)
     if best.share < CERTAIN_SHARE:
-        best = one.better_along(best, guess)
+        best = one.better_along(best)
     if best.share < USUAL_SHARE:
         for start in (guess, before):
             best = _better(one.from_start(start, guess, reach_m), best)
@@ -222,7 +222,7 @@ class _Alignment:
         agreement = self.scans.agreements(self.points, at, on_others)
         return AlignedScan(x[0], seen, float(on_others.mean()), float(agreement[0]))
 
-    def better_along(self, best: AlignedScan, guess: Array) -> AlignedScan:
+    def better_along(self, best: AlignedScan) -> AlignedScan:
         """The best of poses along the direction in which the scan says least, if that is open."""
         variances, axes = np.linalg.eigh(np.linalg.inv(best.information + self.information))
         weakest = axes[:, 2]

@@ -242,7 +242,7 @@ def align_pairs(
     corridor) the covariance is large. A pair's result does not depend on the other pairs.
 
     Returns:
-        Poses (n, 3), their covs (n, 3, 3), and the shares (n,) of points on others, see `fit`.
+        Poses (n, 3), their covs (n, 3, 3), and the shares (n,) of points on others, see `fits`.
     """
     x = np.array(guesses, dtype=float).reshape(-1, 3)
     information, weight = np.zeros((len(x), 3, 3)), np.zeros(len(x))
@@ -267,12 +267,6 @@ def align_pairs(
     return x, _covariance(information, config), weight / count
 
 
-def fit(source: Submap, target: Submap, pose: Array) -> tuple[float, Array, Array]:
-    """How well ``source`` lies on ``target`` at ``pose`` (3,), without moving it; see `fits`."""
-    shares, steps, covs = fits([source], [target], [pose])
-    return float(shares[0]), steps[0], covs[0]
-
-
 def fits(
     sources: Sequence[Submap], targets: Sequence[Submap], poses: Sequence[Array]
 ) -> tuple[Array, Array, Array]:
@@ -291,7 +285,7 @@ def fits(
 
 
 def shares_on_others(sources: Sequence[Submap], targets: Sequence[Submap], poses: Array) -> Array:
-    """Shares (n,) of the points of n submaps that lie on those of others, see `fit`."""
+    """Shares (n,) of the points of n submaps that lie on those of others, see `fits`."""
     if not len(poses):
         return np.zeros(0)
     pairs = _PointPairs(sources, targets)

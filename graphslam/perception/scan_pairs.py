@@ -1,6 +1,6 @@
 """Consecutive scans compared where odometry puts them, many pairs at once.
 
-Most motions are right, and all that is needed is to see that. This is `scan_matching.fit` for the
+Most motions are right, and all that is needed is to see that. This is `scan_matching.fits` for the
 single scans of a block: one tree holds all points, each scan far from the next, and surfaces come
 from the neighbours along the beams instead of those in space.
 """
@@ -35,7 +35,7 @@ BESIDE = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairFits:
-    """How well scans lie on the ones before, see `scan_matching.fit`.
+    """How well scans lie on the ones before, see `scan_matching.fits`.
 
     ``share`` (n,) of points on others, ``step`` (n, 3) of the pose, ``cov`` (n, 3, 3) after it.
     """

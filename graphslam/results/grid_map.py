@@ -11,7 +11,6 @@ from graphslam.results.occupancy_grid import GridMap
 
 #: grey values in mode trinary
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
-MODES = ("trinary", "scale")
 #: occupied_thresh and free_thresh of each mode: what is above the one is 100, below the other 0. In
 #: mode scale map_server stretches what is between them, so that only these leave it as it is
 THRESHOLDS = {"trinary": (0.65, 0.196), "scale": (1.0, 0.0)}

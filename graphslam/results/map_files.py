@@ -61,7 +61,7 @@ def make_map(
         directory: the result folder.
         target: a folder, which may be ``directory``; made if missing.
         resolution_m: edge of a cell; default: as the scans allow.
-        mode: of the grid map, see `graphslam.results.grid_map.MODES`.
+        mode: of the grid map, see `graphslam.results.grid_map.grid_map_files`.
         force: replace files of these names.
 
     Raises:

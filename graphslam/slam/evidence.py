@@ -109,6 +109,11 @@ class RobotEvidence:
     curved: float = 0.0
     skew: SweepSkew = NO_SKEW
 
+    @property
+    def other_sensor(self) -> str:
+        """What can contradict the odometry, in the plural: scans, or sightings without any."""
+        return "scans" if len(self.scans_ns) else "sightings"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:

@@ -269,7 +269,7 @@ def _factors(robot: RobotEvidence) -> Iterator[Reason]:
                 score = min(agreement, FACTORS[0] / ratio, ratio / FACTORS[1])
                 if name not in worst or score < worst[name][0]:
                     worst[name] = score, _how(name, agreement, ratio, where)
-    other = "scans" if len(robot.scans_ns) else "sightings"
+    other = robot.other_sensor
     for _, text in worst.values():
         yield Reason(
             "doubtful",
@@ -290,7 +290,7 @@ def _opposite(robot: RobotEvidence) -> Iterator[Reason]:
     turns = np.flatnonzero((size > SPAN_RAD[0]) & (most < SPAN_RAD[1]))
     for a, b in stretches(ours[turns] * its[turns] < 0):
         if size[turns[a:b]].sum() > OPPOSITE_RAD:
-            other = "scans" if len(robot.scans_ns) else "sightings"
+            other = robot.other_sensor
             since = seconds(int(robot.stamps_ns[grid[turns[a]]]), int(robot.stamps_ns[0]))
             text = (
                 f"and its {other} contradict each other: turning has the other sign from {since} "

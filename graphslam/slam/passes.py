@@ -75,7 +75,7 @@ def run_passes(
         config: settings.
         known: what is known before the first pass.
         progress: see `graphslam.slam.smooth.smooth`.
-        tamper: see `graphslam.slam.reoptimise_scans.Tamper`.
+        tamper: see `graphslam.mapping.loop_closure.Tamper`.
         kept: stages.
 
     Raises:

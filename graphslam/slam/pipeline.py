@@ -94,7 +94,7 @@ class Pipeline(StepRecorder):
     ) -> None:
         """Reads nothing yet.
 
-        For ``tamper`` see `graphslam.slam.reoptimise_scans.Tamper`, for the others `StepRecorder`.
+        For ``tamper`` see `graphslam.mapping.loop_closure.Tamper`, for the others `StepRecorder`.
         """
         super().__init__(log, config, known, batch_steps=batch_steps)
         self.tamper = tamper

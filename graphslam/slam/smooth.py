@@ -38,7 +38,7 @@ def smooth(
         log: opened logs.
         config: settings.
         progress: called with the number of messages read so far.
-        tamper: for tests, see `graphslam.slam.reoptimise_scans.Tamper`.
+        tamper: for tests, see `graphslam.mapping.loop_closure.Tamper`.
         ahead: what `graphslam.slam.log_reader.open_ahead` gives after the log.
         kept: where stages are kept, and those of an earlier run.
         known_map: of an earlier result, in which the log is localised.

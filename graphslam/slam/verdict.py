@@ -15,6 +15,7 @@ import numpy as np
 from graphslam.logs.time_order import TOO_LATE
 from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence
+from graphslam.slam.log_noise import MOTION
 from graphslam.slam.moved_points import moved_doubts
 from graphslam.slam.odometry_doubts import odometry_doubts
 from graphslam.slam.regular_landmarks import regular_landmark_doubts
@@ -98,14 +99,16 @@ def _level(value: float, limits: tuple[float, float]) -> str | None:
 
 def _noise(evidence: Evidence) -> Iterable[Reason]:
     """Noise that is nowhere near what was stated: no noise at all, but a contradiction."""
+    others = {robot.name: robot.other_sensor for robot in evidence.robots}
     for source, found in evidence.summary["noise"].items():
         measured = found.get("measured", {})
         worst = max(measured, key=lambda name: float(measured[name]), default="")
         level = _level(measured[worst], NOISE_FACTORS) if worst else None
         if level:
-            robot = source.rpartition(" ")[0]
+            robot, _, model = source.rpartition(" ")
+            other = others.get(robot, "sightings") if model == MOTION else "sightings"
             text = (
-                f"{robot}: its sightings and its odometry contradict each other: errors of {worst} "
+                f"{robot}: its {other} and its odometry contradict each other: errors of {worst} "
                 f"are {measured[worst] ** 0.5:.0f} times what is stated"
             )
             yield Reason(level, "noise", robot, text)

@@ -17,7 +17,6 @@ from graphslam.change_detection.thesis_method import (
     point_covariances,
     scan_points,
     squared_mahalanobis,
-    stable_points,
 )
 from graphslam.change_detection.visit import visit_from_scans
 from graphslam.core.config import ChangesConfig
@@ -182,13 +181,6 @@ def test_consecutive_beams():
     assert list(np.nonzero(consecutive_runs(marked, 2))[0]) == [2, 3, 5, 6, 7]
     assert list(np.nonzero(consecutive_runs(marked, 3))[0]) == [5, 6, 7]
     assert not consecutive_runs(np.zeros(0, dtype=bool), 2).any()
-
-
-def test_points_that_are_stable_over_time():
-    points = np.array([[1.0, 0], [2.0, 0], [np.nan, 0]])
-    others = [np.array([[1.01, 0], [5.0, 0]]), np.array([[0.99, 0], [np.nan, 0]]),
-              np.array([[2.01, 0.0]])]  # fmt: skip
-    assert list(stable_points(points, others, 0.05, 2)) == [True, False, False]
 
 
 # ------------------------------------------------------------ two visits

@@ -8,8 +8,10 @@ from graphslam.core.consistency import (
     generalised_least_squares,
     greedy_max_clique,
     has_rival,
+    leave_one_out,
     leave_one_out_distances,
 )
+from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import grow_frame_forest
 from graphslam.core.geometry import transform
 
@@ -86,6 +88,25 @@ def test_leave_one_out_distances_are_those_of_the_conditional_gaussian():
         innovation = r[k] - gain @ r.ravel()[rest]
         cov = S[np.ix_(own, own)] - gain @ S[np.ix_(rest, own)]
         np.testing.assert_allclose(found[k], innovation @ np.linalg.solve(cov, innovation))
+
+
+@pytest.mark.parametrize("of", ["innovation", "covariance"])
+def test_measurements_that_are_not_numbers_are_an_error(of, monkeypatch):
+    """None of them is the worst, so none would ever be removed. Three can be removed twice."""
+    r, S, calls = np.zeros((3, 3)), np.eye(9), []
+
+    def ends(*given):
+        calls.append(given)
+        assert len(calls) < 3, "it does not end"
+        return leave_one_out_distances(*given)
+
+    monkeypatch.setattr("graphslam.core.consistency.leave_one_out_distances", ends)
+    if of == "innovation":
+        r[1, 2] = np.nan
+    else:
+        S[0, 5] = S[5, 0] = np.nan
+    with pytest.raises(EstimationError, match="3 measurements cannot be compared"):
+        leave_one_out(np.arange(3), r, S, 0.99)
 
 
 def test_least_squares_with_correlated_rows_and_a_prior():

@@ -358,17 +358,6 @@ def test_a_noise_model_keeps_ten_decades():
             np.testing.assert_allclose(R @ cov @ R.T, np.eye(3), atol=1e-15 / spread**2)
 
 
-@pytest.mark.parametrize("two", [False, True])
-def test_rows_of_one_or_two_variables_stay_in_their_order(two):
-    rng = np.random.default_rng(1)
-    A, b = rng.normal(size=(2, 5 if two else 3)), rng.normal(size=2)
-    factor = factors.jacobian_factor(A, b, {T: 3, X: 2} if two else {T: 3})
-    found, right = factor.jacobian()
-    np.testing.assert_array_equal(found, A)
-    np.testing.assert_array_equal(right, b)
-    assert list(factor.keys()) == ([T, X] if two else [T])
-
-
 # ------------------------------------------------------------ the 30 m corridor
 
 STEP_M, KEYFRAMES, ODOMETRY_SIGMA_M = 0.25, 120, 0.02

@@ -108,6 +108,21 @@ def test_another_visit_begins_landmarks_of_its_own():
         assert len(found.entries) == (3 if same else 6)
 
 
+def test_a_wall_left_behind_stays_where_it_was_seen():
+    """Without noise the entries of retired walls are those walls. They are retired between a motion
+    and its image: seen from the pose before, they would be off by that motion, 0.5 m and 0.1 rad.
+    1e-9: rounding over 60 motions."""
+    found, pose, step = tracker(), np.zeros(3), np.array([0.5, 0.0, 0.1])
+    for k in range(60):
+        if k:
+            found.move(motion(step, k))
+            pose = compose(pose, step)
+        found.track(k * S, lines(pose, WALLS) if k < 4 else ObservationArrays.of([]))
+    assert sorted(found.entries) == [0, 1, 2] and not len(found._filter)
+    for number, entry in found.entries.items():
+        np.testing.assert_allclose(between(WALLS[number], entry.mean), 0.0, atol=1e-9)
+
+
 def test_the_cost_of_an_image_does_not_grow_with_the_path():
     """The filter holds what was seen in the last metres, however many walls the path has."""
     found, pose = tracker(), np.zeros(3)

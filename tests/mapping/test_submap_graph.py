@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import between, compose, log, rotate_cov
 from graphslam.estimation import factors
 from graphslam.mapping.submap_graph import SubmapConstraints, SubmapGraph
@@ -107,6 +108,26 @@ def test_what_follows_says_nothing_about_the_beginning():
     np.testing.assert_allclose(part.poses, whole.poses, atol=1e-4)
     part.solve(closure)
     np.testing.assert_allclose(part.poses, whole.poses, atol=1e-5)
+
+
+def test_submaps_that_are_not_in_use_are_refused():
+    """They have no rows: without a word, those of the last submap in use would be read."""
+    _, chain, poses, closure = ring()
+    graph = SubmapGraph(poses, chain, [0], START)
+    graph.begin_with(np.array([5]))
+    graph.solve()
+    used, unused = np.array([0, 5]), np.array([5, 7])
+    for ask in (
+        lambda: graph.covariance(unused),
+        lambda: graph.relative(used, unused),
+        lambda: graph.relative(unused, used),
+        lambda: graph.solve(closure),
+    ):
+        with pytest.raises(EstimationError, match=r"submaps (7|11): are not in use yet"):
+            ask()
+    graph.begin_with(None)
+    graph.solve(closure)
+    assert graph.covariance(unused).shape == (6, 6)
 
 
 def test_the_beginnings_of_several_paths():

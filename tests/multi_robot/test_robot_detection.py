@@ -191,6 +191,27 @@ def test_two_robots_of_one_shape_side_by_side_are_not_distinguished():
     assert np.count_nonzero(seen.scan.ranges < 10) <= 4
 
 
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize(
+    "aside_m, sigma_m, seen", [(0, 0.1, []), (0.4, 0.1, ["b"]), (0.5, 2, ["b"])]
+)
+def test_one_cluster_is_at_most_one_robot(name, aside_m, sigma_m, seen):
+    """Of two robots of one shape one is 4 m ahead, the other is hidden. Expected at one place,
+    nothing tells which one it is: neither is seen. If c is expected 4 of its sigmas aside, or
+    anywhere within metres, b is more than exp(4.5) times as likely, and it is seen alone."""
+    body, at = BODIES[name], np.array([4.0, 0.0, 0.3])
+    (scan,) = scans(np.zeros((1, 3)), HALL, {"b": (body, at[None])}, np.random.default_rng(2))
+    there = at + np.array([0.0, aside_m, 0.0])
+    known = {
+        "c": ExpectedPose(there, np.diag([sigma_m, sigma_m, 0.05]) ** 2),
+        "b": ExpectedPose(at, np.diag([0.1, 0.1, 0.05]) ** 2),
+    }
+    found = detect_robots(scan, known, dict.fromkeys("bc", outline(body)), CONFIG)
+    assert [one.seen_robot for one in found.sightings] == seen
+    # whoever it is, it is no wall
+    assert np.count_nonzero(found.scan.ranges < 10) <= 4
+
+
 # ------------------------------------------------------------ things that move
 
 

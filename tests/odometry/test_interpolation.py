@@ -222,6 +222,20 @@ def test_no_correction_happens_while_the_robot_stands():
     np.testing.assert_allclose(found[3], [1.0, 0.1, 0.0], atol=1e-12)
 
 
+def test_a_late_robot_is_corrected_when_its_sensor_sees_it_drive():
+    """By its odometry it drives from 2 to 3 s and stands else; its sensor, 0.4 s late, sees that
+    from 2.4 to 3.4 s. Before and after, the poses are those of the states, and halfway half of the
+    correction is done. By the odometry's times it would begin while the robot stands. 1e-9: stamps
+    are whole nanoseconds, a few roundings."""
+    times = [0, 2, 3, 8]
+    track = odometry_track(times, [[0, 0, 0], [0, 0, 0], [1, 0, 0], [1, 0, 0]], mounted=True)
+    track.calibration = replace(track.calibration, mean=np.array([0, 0, 0, 0, 0, 0, 0.4]))
+    ends = Trajectory(ns([1, 6]), np.array([[0, 0, 0], [1.1, 0, 0]]), np.zeros((2, 3, 3)))
+    found = at([2.35, 2.9, 3.4, 5.0], causal=False, given=ends, track=track)
+    expected = [[0, 0, 0], [0.55, 0, 0], [1.1, 0, 0], [1.1, 0, 0]]
+    assert_same_pose(found.poses, np.array(expected), atol=1e-9)
+
+
 def test_where_a_robot_slipped_between_states_is_not_known():
     """By odometry it drove 2 m, by the states 1 m: the metre was lost anywhere between them. As
     noise, which adds up bit by bit, half way 1 cm would be left of it."""

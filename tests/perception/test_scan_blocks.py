@@ -12,7 +12,7 @@ from graphslam.core.records import Observation, Scan
 from graphslam.perception.dynamic_objects import dynamic_returns, dynamic_returns_of_all
 from graphslam.perception.front_ends import FRONT_ENDS, observe_block
 from graphslam.perception.ordered_scan import make_sweep, scan_points
-from graphslam.perception.scan_matching import fit, make_submap
+from graphslam.perception.scan_matching import fits, make_submap
 from graphslam.perception.scan_pairs import fit_pairs
 
 BEAMS, STEP = 361, np.radians(0.5)
@@ -95,7 +95,7 @@ def test_moving_objects_of_a_block_are_those_of_each_scan(drive):
 
 def test_pairs_of_a_block_fit_as_each_pair_does(drive):
     """At the true motion nearly all points lie on others and the step is small; half a metre off
-    few do. As `fit` says, within 0.1: it takes a surface's direction from neighbours in space."""
+    few do. As `fits` says, within 0.1: it takes a surface's direction from neighbours in space."""
     scans, _ = drive
     config = ScanMatchingConfig()
     clouds = [scan_points(scan, 30.0) for scan in scans[:4]]
@@ -107,9 +107,9 @@ def test_pairs_of_a_block_fit_as_each_pair_does(drive):
     assert np.abs(good.step).max() < 0.02
     for k in range(3):
         maps = [make_submap(np.zeros((1, 3)), [clouds[n]], config) for n in (at[k], later[k])]
-        share, _, cov = fit(maps[1], maps[0], true[k])
-        assert abs(good.share[k] - share) < 0.1
-        assert 0.5 < np.sqrt(good.cov[k, 2, 2] / cov[2, 2]) < 2.0
+        share, _, cov = fits(maps[1:], maps[:1], true[k : k + 1])
+        assert abs(good.share[k] - share[0]) < 0.1
+        assert 0.5 < np.sqrt(good.cov[k, 2, 2] / cov[0, 2, 2]) < 2.0
 
 
 def test_observations_as_arrays_and_back():

@@ -471,6 +471,21 @@ def test_counts_of_the_run_are_judged(change, level, text):
     assert verdict == level and text in told
 
 
+@pytest.mark.parametrize(
+    ("source", "scans", "other"),
+    [
+        ("tom motion", True, "scans"),
+        ("tom motion", False, "sightings"),
+        ("tom robot-point", True, "sightings"),
+    ],
+)
+def test_noise_is_told_by_the_sensor_that_contradicts_odometry(source, scans, other):
+    """That of motions by scans where there are any; that of sightings by themselves."""
+    noise = {"noise": {source: {"measured": {"one": 100.0}}}}
+    _, told = reasons(replace(evidence(scans=scans), summary=SUMMARY | noise))
+    assert f"tom: its {other} and its odometry contradict each other: errors of one" in told
+
+
 def test_a_closure_that_the_path_misses_is_doubted_and_one_that_leaves_a_direction_open_is_not():
     """A robust kernel bears it: 1 m of slip along a corridor bent no path, and nobody was told."""
     times = np.array([[S + 50 * S, S], [S + 40 * S, S + 2 * S]])
