@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.records import Landmark
@@ -77,14 +78,19 @@ def latest_places(submaps: Sequence[SubmapPose]) -> tuple[SubmapPose, ...]:
         if not (near & (np.abs(wrap(off[:, 2])) < SAME_PLACE_RAD)).any():
             kept.append(k)
     return tuple(
-        map_place(n, submaps[k].pose, submaps[k].submap.poses, submaps[k].submap.clouds)
-        for n, k in enumerate(kept)
+        map_place(n, one.pose, one.submap.poses, one.submap.clouds, one.submap.config)
+        for n, one in enumerate(submaps[k] for k in kept)
     )
 
 
-def map_place(number: int, pose: Array, poses: Array, clouds: Sequence[Array]) -> SubmapPose:
-    """Place ``number`` of a map at ``pose`` (3,): scans ``clouds`` from ``poses`` (k, 3) in it."""
+def map_place(
+    number: int, pose: Array, poses: Array, clouds: Sequence[Array], config: ScanMatchingConfig
+) -> SubmapPose:
+    """Place ``number`` of a map at ``pose`` (3,): scans ``clouds`` from ``poses`` (k, 3) in it.
+
+    It is matched by ``config``.
+    """
     # places have no path; negative times put them before everything that is new
     time_ns = number - 1_000_000_000
-    submap = make_submap(poses, clouds)
+    submap = make_submap(poses, clouds, config)
     return SubmapPose((MAP_ROBOT, time_ns), pose, 0.0, (time_ns, time_ns), submap)

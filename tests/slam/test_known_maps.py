@@ -11,10 +11,12 @@ import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.core.geometry import rotate_cov, rotation3
+from graphslam.mapping.known_map import latest_places
 from graphslam.mapping.landmark_records import ALONG, SHORTEST_M
 from graphslam.results.folder import JOINT_FILE
 from graphslam.results.known_map_file import (
     KNOWN_MAP_FILE,
+    known_map_of,
     landmark_covariance,
     load_known_map,
 )
@@ -241,6 +243,22 @@ def test_what_is_no_map_is_one_clear_line(tmp_path, first_day):
     (old / KNOWN_MAP_FILE).write_bytes(b"no archive")
     with pytest.raises(OutputError, match=KNOWN_MAP_FILE):
         load_known_map(old)
+
+
+def test_places_of_a_map_are_matched_by_the_settings_of_the_log(tmp_path, first_day):
+    """Made of a result, read from a file, or of sessions: else only half of the matcher's settings
+    are in force, those of the new scans."""
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.3, seed=3)
+    localised(log, first_day, output=tmp_path / "later")
+    coarse = {"scan_matching.cell_m": 0.1}
+    for folder in (first_day, tmp_path / "later"):
+        config = graphslam.load_config(**{"known_map.directory": str(folder)}, **coarse)
+        places = known_map_of(config).places
+        assert {place.submap.config for place in places} == {config.scan_matching}
+        default = load_known_map(folder).places
+        assert len(places[0].submap.points) < 0.7 * len(default[0].submap.points)
+        again = latest_places(places)
+        assert {place.submap.config for place in again} == {config.scan_matching}
 
 
 def test_the_joint_covariance_has_the_marginals_of_the_landmarks(first_day):
