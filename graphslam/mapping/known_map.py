@@ -31,7 +31,8 @@ class KnownMap:
     ``name`` of the result that it is of, ``sha256`` of its content. ``landmarks``: all of them;
     ``known``: their joint Gaussian as a day sees them, each wall with an error of its own across
     it, of sigma ``bias_m``. ``places``: submaps at poses in the world. ``parents``: the maps that
-    it continues, the first one first, name and sha256 each.
+    it continues, the first one first, name and sha256 each. ``is_world_given``: whether its world
+    frame was told by a start, and not only the first pose of a robot.
     """
 
     name: str
@@ -41,6 +42,7 @@ class KnownMap:
     places: tuple[SubmapPose, ...]
     bias_m: float = 0.0
     parents: tuple[tuple[str, str], ...] = ()
+    is_world_given: bool = False
 
     @property
     def ancestry(self) -> tuple[tuple[str, str], ...]:

@@ -83,7 +83,8 @@ def load_known_map(directory: Path, matching: ScanMatchingConfig | None = None) 
     known = known_landmarks(landmarks, cov)
     places = latest_places(_submaps(directory, saved, matching))
     name, sha256 = directory.absolute().name, _digest(directory)
-    return KnownMap(name, sha256, landmarks, known, places, bias_m)
+    given = saved.config.start.from_truth or bool(saved.config.start.poses)
+    return KnownMap(name, sha256, landmarks, known, places, bias_m, is_world_given=given)
 
 
 def known_map_of(config: Config) -> KnownMap | None:
@@ -130,7 +131,9 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
     found = build_submaps(result.estimate.states, result.keyframe_scans, result.config)
     places = latest_places([*found, *earlier.places])
     # named by its folder, identified by its content
-    return KnownMap("", "", landmarks, known, places, bias_m, earlier.ancestry)
+    return KnownMap(
+        "", "", landmarks, known, places, bias_m, earlier.ancestry, earlier.is_world_given
+    )
 
 
 def landmark_covariance(
@@ -224,6 +227,7 @@ def known_map_bytes(known: KnownMap) -> bytes:
         "rows": np.concatenate([np.zeros(0), *(row.ravel() for row in root.rows)]),
         "widening": np.array(root.widening),
         "bias_m": np.array(known.bias_m),
+        "is_world_given": np.array(known.is_world_given),
         "place_pose": np.array([p.pose for p in known.places]).reshape(-1, 3),
         "place_scans": np.array([len(p.submap.clouds) for p in known.places], dtype=np.int32),
         "sensor": np.concatenate([np.zeros((0, 3)), *(p.submap.poses for p in known.places)]),
@@ -282,4 +286,5 @@ def _known_map(
     if str(arrays["name"]):  # a copy
         name, sha256 = str(arrays["name"]), str(arrays["sha256"])
     bias_m = float(arrays.get("bias_m", 0.0))  # of older ones it is not known
-    return KnownMap(name, sha256, landmarks, known, places, bias_m, told)
+    given = bool(arrays.get("is_world_given", False))
+    return KnownMap(name, sha256, landmarks, known, places, bias_m, told, given)

@@ -10,7 +10,7 @@ from walls import rectangles
 import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
-from graphslam.core.geometry import rotate_cov, rotation3
+from graphslam.core.geometry import between, rotate_cov, rotation3
 from graphslam.mapping.known_map import latest_places
 from graphslam.mapping.landmark_records import ALONG, SHORTEST_M
 from graphslam.results.folder import JOINT_FILE
@@ -206,6 +206,28 @@ def test_what_is_gone_is_retired_and_what_is_new_added(tmp_path, first_day):
     assert {mark.id for mark in visit.landmarks} == numbers - unseen
     new = [mark for mark in after.landmarks if mark.id >= before.next_number]
     assert any(np.hypot(*(mark.extent.mean(axis=0) - [8.5, 7.0])) < 0.3 for mark in new)
+
+
+def test_a_result_is_judged_in_the_frame_of_its_map(tmp_path, first_day):
+    """A map whose start nobody told is in a frame of its own, and so is what is started in it.
+    Good paths were judged to be metres off."""
+    own = tmp_path / "own"
+    graphslam.smooth(drive(tmp_path / "first.mcap", room=FURNISHED), output=own)
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.3, seed=3)
+    there = between(true_pose(0.0), true_pose(0.0, 0.3))
+    update = {"known_map.update": True}
+    result = localised(
+        log, own, output=tmp_path / "later", **update, **{"start.poses.robot": there.tolist()}
+    )
+    found = graphslam.evaluate(result)
+    assert not found["common_frame"]
+    errors = found["robots"]["robot"]["final"]
+    assert errors["ate_rmse_m"] is None
+    assert errors["ate_aligned_rmse_m"] < 0.03
+    assert not load_known_map(tmp_path / "later").is_world_given
+    assert load_known_map(first_day).is_world_given
+    localised(log, first_day, output=tmp_path / "told", **update)
+    assert load_known_map(tmp_path / "told").is_world_given
 
 
 def test_what_is_no_map_is_one_clear_line(tmp_path, first_day):
