@@ -39,7 +39,7 @@ from graphslam.multi_robot.place_search import (
     search_poses,
 )
 from graphslam.multi_robot.relative_frames import RelativeFrame, evenly_spaced
-from graphslam.perception.scan_matching import IntArray, Match, match
+from graphslam.perception.scan_matching import IntArray, Match, match, match_pairs
 
 #: submaps of a robot that are searched for at most
 MAX_SUBMAPS = 80
@@ -128,14 +128,23 @@ def match_places(
     found = []
     for k in evenly_spaced(np.arange(len(places_b)), MAX_SUBMAPS):
         submap = places_b[k].submap
-        for pose in search_poses(spectrum, submap.points, config.place_range_m):
-            verified = []
-            for j in nearest_of_each_pass(positions, pose):
-                guess = between(places_a[j].pose, pose)
-                best = verify_match(match(submap, places_a[j].submap, guess, window))
-                if best is not None:
-                    verified.append(PlaceMatch(j, int(k), best))
-            best_match = max(verified, key=lambda m: m.score, default=None)
+        poses = search_poses(spectrum, submap.points, config.place_range_m)
+        pairs = [
+            (n, j) for n, pose in enumerate(poses) for j in nearest_of_each_pass(positions, pose)
+        ]
+        # all at once: most of the time of a single pair is not in its points
+        matched = match_pairs(
+            [submap] * len(pairs),
+            [places_a[j].submap for _, j in pairs],
+            [between(places_a[j].pose, poses[n]) for n, j in pairs],
+            [window] * len(pairs),
+        )
+        verified: list[list[PlaceMatch]] = [[] for _ in poses]
+        for (n, j), matches in zip(pairs, matched, strict=True):
+            if (best := verify_match(matches)) is not None:
+                verified[n].append(PlaceMatch(j, int(k), best))
+        for own in verified:
+            best_match = max(own, key=lambda m: m.score, default=None)
             if best_match is not None and best_match.score > 0:
                 found.append(best_match)
     return found
