@@ -5,6 +5,8 @@ distance, is hardly contradicted, and no other one explains about as much, place
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
@@ -33,21 +35,41 @@ EQUAL_SHARE = 0.7
 RECOGNISED_SHARE, FAINT_SHARE = 0.75, 0.1
 
 
+class Telling(IntEnum):
+    """How much a reason says about where a path lies, the least first.
+
+    Little in common says nothing. What contradicts a hypothesis has at least been recognised, and
+    two that explain all of it say that it is there, in one of two ways.
+    """
+
+    NOTHING, FEW, NEAR, CONTRADICTED, RIVALS = range(5)
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why no hypothesis is believed, and how telling that is among the reasons of several maps."""
+
+    text: str
+    telling: Telling
+
+
 def best_explanation(
     found: Sequence[Support], places: Sequence[SubmapPose], config: MultiRobotConfig
-) -> tuple[int, str]:
+) -> tuple[int, Refusal | None]:
     """The hypothesis, of at least one, that explains places best, and why it is not believed.
 
-    That is "" if it is. Others are rivals by what they explain about as well, place by place: a
+    That is None if it is. Others are rivals by what they explain about as well, place by place: a
     building turned by half a turn has walls everywhere too, but they fit worse.
     """
     index = max(range(len(found)), key=lambda k: (not found[k].is_contradicted, found[k].total))
     best = found[index]
     rivals = [_as_rival(one, best) for one in found if one is not best]
     chosen = choose([best, *rivals], places, config, may_contradict=_stands_alone(best, found))
-    if isinstance(chosen, str):
+    if isinstance(chosen, Refusal):
         return index, chosen
-    return index, "" if chosen == 0 else "more than one relative pose explains what was seen"
+    if chosen == 0:
+        return index, None
+    return index, Refusal("more than one relative pose explains what was seen", Telling.RIVALS)
 
 
 def choose(
@@ -56,7 +78,7 @@ def choose(
     config: MultiRobotConfig,
     *,
     may_contradict: bool = False,
-) -> int | str:
+) -> int | Refusal:
     """Which of several hypotheses, at least one, is right, or why that is not known.
 
     ``may_contradict``: however many places contradict it, if nothing else is against it.
@@ -66,17 +88,24 @@ def choose(
     one = found[best]
     count = int(one.confirmed.sum())
     if count < MIN_MATCHES:
-        return f"only {count} of {len(places)} places are recognised"
+        return Refusal(f"only {count} of {len(places)} places are recognised", Telling.FEW)
     if extent([p for p, is_seen in zip(places, one.confirmed, strict=True) if is_seen]) < (
         config.min_place_extent_m
     ):
-        return "the places that are recognised extend over less than multi_robot.min_place_extent_m"
+        return Refusal(
+            "the places that are recognised extend over less than multi_robot.min_place_extent_m",
+            Telling.NEAR,
+        )
     others = [x for x in found if differ(one, x)]
     rivals = [x.total for x in others if not x.is_contradicted]
     if has_rival(one.total, rivals) or has_rival(one.total, [x.total for x in others], EQUAL_SHARE):
-        return "it has places that look alike, and the path fits into it in more than one way"
+        return Refusal(
+            "it has places that look alike, and the path fits into it in more than one way",
+            Telling.RIVALS,
+        )
     if one.is_contradicted and not may_contradict:
-        return f"{int(one.contradicted.sum())} of {len(places)} places contradict it"
+        against = int(one.contradicted.sum())
+        return Refusal(f"{against} of {len(places)} places contradict it", Telling.CONTRADICTED)
     return best
 
 

@@ -155,10 +155,11 @@ def found_start(
         found.append((laid_start(laid, robot), laid))
     why = "no place in it is recognised"
     if supports:
-        best, why = best_explanation(supports, own.places, scan_log.config.multi_robot)
-        if not why:
+        best, refusal = best_explanation(supports, own.places, scan_log.config.multi_robot)
+        if refusal is None:
             scan_log.map_doubt = doubt(supports[best], own.places, scan_log.config.loop_closure)
             return found[best]
+        why = refusal.text
     raise EstimationError(
         f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; give "
         f"another map, or {start_option(robot)} (m, rad)"

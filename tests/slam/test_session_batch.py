@@ -44,6 +44,7 @@ def test_sessions_that_begin_anywhere_are_one_map(tmp_path):
     result = graphslam.smooth(days, config=SAME_PLACE, **told)
     assert set(result.summary["frames"].values()) == {"day0"}
     assert {one["seen_with"] for one in result.summary["starts_found"].values()} == {"day0"}
+    assert result.summary["stages"]["joining"] > result.summary["stages"]["read"]
     errors = evaluate(result, read_truth(days, SAME_PLACE).trajectories)["joint"]["final"]
     # scans of 1 cm noise place the robot to a centimetre; three are the bar of sessions
     assert errors["ate_rmse_m"] < 0.03
@@ -59,6 +60,7 @@ def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):
     result = graphslam.smooth(days, config=SAME_PLACE)
     assert result.summary["frames"] == {"day0": "day0", "day1": "day1"}
     (why,) = [line for line in result.summary["warnings"] if line.startswith("day1: ")]
+    assert "day1: in the map of day0: " in why
     assert "more than one way" in why
     assert "--start day1=x,y,phi places it" in why
     assert result.summary["sessions"]["apart"].keys() == {"day1"}
