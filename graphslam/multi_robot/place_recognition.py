@@ -28,6 +28,8 @@ from graphslam.core.geometry import (
     compose,
     inverse,
     rotation3,
+    transform,
+    unit_vectors,
     wrap,
 )
 from graphslam.mapping.loop_closure import COV_INFLATION, verify_match
@@ -197,8 +199,8 @@ def choose_alignment(
     )
     if min(extents) < config.min_place_extent_m:
         return (
-            f"the places that {a} and {b} have in common extend over less than "
-            "multi_robot.min_place_extent_m"
+            f"the places that {a} and {b} have in common extend over {min(extents):.1f} m only, "
+            f"{alike(min(extents))}"
         )
     # a match with a clearly lower score at its place does not speak for another alignment
     best_score = {found[k].index_b: scores[k] for k in best}
@@ -341,6 +343,27 @@ def consensus(starts: Array, covs: Array, members: IntArray) -> Consensus:
     pose = reference + fit.x
     pose[2] = wrap(pose[2])
     return Consensus(pose, fit.cov, d2)
+
+
+def alike(extent_m: float) -> str:
+    """Why places that extend over so little, m, are not enough, and what accepts them."""
+    accepted = max(np.floor(20.0 * extent_m) / 20.0 - 0.05, 0.0)
+    return f"and rooms look alike (--set multi_robot.min_place_extent_m={accepted:.3g} accepts it)"
+
+
+def seen_extent(*maps: Sequence[SubmapPose]) -> float:
+    """The longest distance, m, between any two points that are seen from places of one map."""
+    return max(map(_seen_extent, maps))
+
+
+def _seen_extent(places: Sequence[SubmapPose]) -> float:
+    points = np.concatenate(
+        [np.zeros((0, 2)), *(transform(place.pose, place.submap.points) for place in places)]
+    )
+    if not len(points):
+        return 0.0
+    across = points @ unit_vectors(np.linspace(0.0, np.pi, 36, endpoint=False)).T
+    return float(np.ptp(across, axis=0).max())
 
 
 def extent(places: Sequence[SubmapPose]) -> float:

@@ -35,7 +35,7 @@ from graphslam.multi_robot.hypothesis_choice import (
     doubt,
 )
 from graphslam.multi_robot.map_localisation import Support, support
-from graphslam.multi_robot.place_recognition import PlaceMap
+from graphslam.multi_robot.place_recognition import PlaceMap, seen_extent
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.slam.localisation import (
@@ -289,7 +289,10 @@ def _joined(
     if not laid:
         return Refusal("no place is recognised", Telling.NOTHING)
     places = [place for name in other.starts for place in sessions[name].own.places]
-    index, why = best_explanation([one.support for one in laid], places, config.multi_robot)
+    own = [place for name, start in other.starts.items() for place in sessions[name].at(start)]
+    seen_m = seen_extent(one.map.places, own)
+    supports = [found.support for found in laid]
+    index, why = best_explanation(supports, places, config.multi_robot, seen_m)
     best = laid[index]
     if why:
         return why

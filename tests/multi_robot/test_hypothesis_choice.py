@@ -1,5 +1,6 @@
 """Which of several hypotheses about a path in a map is believed."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -56,9 +57,40 @@ def test_too_little_is_refused():
     """Few places, places of one room, and places that contradict the map."""
     few = replace(hypothesis(0.9, 0), confirmed=np.arange(6) < 3)
     assert "only 3 of 6" in chosen(few).text
-    wide = MultiRobotConfig(min_place_extent_m=20.0)
-    assert "extend over less" in choose([hypothesis(0.9, 0)], PLACES, wide).text
+    assert (
+        "extend over 15.0 m only"
+        in choose([hypothesis(0.9, 0)], PLACES, MultiRobotConfig(min_place_extent_m=20.0)).text
+    )
     assert "3 of 6 places contradict it" in chosen(hypothesis(0.9, 3)).text
+
+
+def test_what_accepts_places_that_are_near_each_other_is_named_and_does():
+    """The setting was named without a value, and without how it is given."""
+    near = [SimpleNamespace(pose=pose * [0.17, 1.0, 1.0]) for pose in POSES]
+    refusal = choose([hypothesis(0.9, 0)], near, MultiRobotConfig())
+    (told,) = re.findall(r"--set multi_robot.min_place_extent_m=([0-9.]+) accepts", refusal.text)
+    assert 2.0 < float(told) < 2.55  # of 2.55 m
+    assert choose([hypothesis(0.9, 0)], near, MultiRobotConfig(min_place_extent_m=float(told))) == 0
+
+
+@pytest.mark.parametrize(
+    ("seen_m", "absent", "accepted"),
+    [(6.0, 0.02, True), (6.0, 0.05, False), (7.0, 0.0, False), (np.inf, 0.0, False)],
+)
+def test_a_small_room_is_enough_if_nobody_saw_more_and_nothing_contradicts_it(
+    seen_m, absent, accepted
+):
+    """Places over 2.55 m, 0.4 of 6.4 m. A mirrored room of 4 m contradicts places by 0.05, less
+    than the 0.07 from which a place contradicts; so it would be taken for the same."""
+    near = [SimpleNamespace(pose=pose * [0.17, 1.0, 1.0]) for pose in POSES]
+    one = replace(hypothesis(0.9, 0), absent=np.full(6, absent))
+    for alone in (False, True):
+        chosen = choose([one], near, MultiRobotConfig(), seen_m, may_contradict=alone)
+        if accepted:
+            assert chosen == 0
+        else:
+            assert "rooms look alike (--set" in chosen.text
+    assert choose([one], PLACES, MultiRobotConfig(), seen_m) == 0  # of a building
 
 
 @pytest.mark.parametrize(
@@ -157,6 +189,6 @@ def test_much_may_have_been_moved_where_nothing_else_explains_anything():
     for found in ([nothing], [moved, turned]):
         assert "places contradict it" in best_explanation(found, LONG_PLACES, CONFIG)[1].text
     # few places, or places of one room, are refused whatever speaks for them
-    assert "less than multi_robot.min_place_extent_m" in (
+    assert "extend over 0.0 m only" in (
         best_explanation([moved], [SimpleNamespace(pose=np.zeros(3))] * 12, CONFIG)[1].text
     )

@@ -88,6 +88,16 @@ def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):
     assert localised(log, tmp_path / "first", **told).summary["known_map"]["seen"] >= 4
 
 
+def test_a_start_is_found_in_a_small_room(tmp_path):
+    """Default settings refused it: places of a room of 7 m cannot extend over 6 m."""
+    room = rectangles((1.3, 1.0, 8.7, 7.0), (1.3, 6.0, 2.5, 7.0), (8.2, 1.0, 8.7, 3.0))
+    known = tmp_path / "first"
+    graphslam.smooth(drive(tmp_path / "first.mcap", room=room), output=known)
+    log = drive(tmp_path / "later.mcap", room=room, phase=0.3, seed=3)
+    result = graphslam.smooth(log, **{"known_map.directory": str(known)})
+    assert graphslam.evaluate(result)["robots"]["robot"]["final"]["ate_aligned_rmse_m"] < 0.03
+
+
 def test_another_building_is_refused_and_nothing_written(tmp_path, first_day):
     """A map in which hardly anything is recognised must not bend the path."""
     other = rectangles((-3, -1, 17, 11), (4, 3.5, 6, 4.5), (10, 2, 11, 7))
