@@ -300,7 +300,7 @@ def test_the_examples_of_the_docs_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for k in range(2 if "change" in page else 1):
         name = ("before", "after")[k] if "change" in page else "drive"
-        drive(tmp_path / f"{name}.mcap", seconds=20)
+        drive(tmp_path / f"{name}.mcap", seconds=20, seed=k)
         if "change" in page:
             graphslam.smooth(f"{name}.mcap", output=name)
     text = (ROOT / page).read_text(encoding="utf-8")

@@ -1,6 +1,7 @@
 """Reads two result folders and writes a folder of changes: JSON, a map, MCAP, a report."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -33,8 +34,23 @@ def changes_between(
             in common.
         LogError: a log is missing or has changed.
     """
-    a, b, same = load_visits(reference, later, config, reference_span_s, later_span_s)
-    return detect_changes(a, b, config, identity_registration(a) if same else None)
+    visits = load_visits(reference, later, config, reference_span_s, later_span_s)
+    registration = identity_registration(visits.reference) if visits.same_frame else None
+    found = detect_changes(visits.reference, visits.later, config, registration)
+    return replace(found, warnings=(*visits.warnings, *found.warnings))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visits:
+    """Two visits that have no scan in common.
+
+    ``same_frame``: whether they are spans of one run; ``warnings``: what was left out.
+    """
+
+    reference: Visit
+    later: Visit
+    same_frame: bool
+    warnings: tuple[str, ...] = ()
 
 
 def load_visits(
@@ -43,12 +59,12 @@ def load_visits(
     config: ChangesConfig,
     reference_span_s: Span | None,
     later_span_s: Span | None,
-) -> tuple[Visit, Visit, bool]:
-    """Both visits, and whether they are of one run, which has one frame.
+) -> Visits:
+    """Both visits, without the scans that they share.
 
     Raises:
-        OutputError: a folder is not a result, has no scans or covariances in the span, or one
-            folder is given twice without spans.
+        OutputError: a folder is not a result, has no scans or covariances in the span, one folder
+            is given twice without spans, or both are of the same scans.
         LogError: a log is missing or has changed.
     """
     same = reference.resolve() == later.resolve()
@@ -62,7 +78,39 @@ def load_visits(
         a = select_time_span(a, reference_span_s, "--reference-span")
     if later_span_s is not None:
         b = select_time_span(b, later_span_s, "--later-span")
-    return a, b, same
+    return _independent(Visits(a, b, same), reference, later)
+
+
+def _independent(visits: Visits, reference: Path, later: Path) -> Visits:
+    """The visits without what they share: a scan that is compared with itself is no second visit.
+
+    Both estimate its pose, and differ by less than their covariances say; where they differ by
+    more, as whole maps do that were solved with different sessions, nothing has changed either. It
+    is left out of the later visit, or of the reference if nothing else is in the later one.
+
+    Raises:
+        OutputError: they have nothing else.
+    """
+    a, b = visits.reference, visits.later
+    of_b, of_a = b.shared_with(a), a.shared_with(b)
+    if not of_b.any():
+        return visits
+    if of_a.all() and of_b.all():
+        raise OutputError(
+            f"{later}: is of the same scans as {reference}; compare results of different "
+            "recordings, or spans of one run that do not overlap"
+        )
+    folder, shared = (reference, of_a) if of_b.all() else (later, of_b)
+    said = (
+        f"{int(shared.sum())} of {len(shared)} scans of {folder.name} are left out: "
+        "the other visit has the same ones"
+    )
+    left = (a if of_b.all() else b).select(~shared)
+    if not visits.same_frame:  # of one run both have its landmarks, by number
+        left = left.with_shown_landmarks()
+    if of_b.all():
+        return replace(visits, reference=left, warnings=(said,))
+    return replace(visits, later=left, warnings=(said,))
 
 
 def check_changes_target(directory: Path, *, force: bool) -> Identity:

@@ -72,6 +72,7 @@ class ThesisChanges:
         regions: of marked points, largest first.
         gate: on the squared distance of 5.14.
         rate: the false-alarm rate that the gate is for, if errors were independent.
+        warnings: what was left out, one line each.
     """
 
     reference: Visit
@@ -84,6 +85,7 @@ class ThesisChanges:
     regions: tuple[MarkedRegion, ...]
     gate: float
     rate: float
+    warnings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of changes.json."""
@@ -110,7 +112,7 @@ class ThesisChanges:
             "gate": self.gate,
             "registration": pose_to_dict(self.registration.pose, self.registration.cov)
             | {"landmarks": len(self.registration.matched)},
-            "warnings": [],
+            "warnings": list(self.warnings),
         }
 
 

@@ -1,7 +1,7 @@
 # ruff: noqa: RUF001 -- σ and × are meant: people read them
 """What `graphslam changes --method thesis` writes: the maps of chapter 5, the decisions, a page."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
@@ -42,8 +42,9 @@ def thesis_changes_between(
             registered.
         LogError: a log is missing or has changed.
     """
-    a, b, same = load_visits(reference, later, config, reference_span_s, later_span_s)
-    return thesis_changes(a, b, config, same_frame=same)
+    visits = load_visits(reference, later, config, reference_span_s, later_span_s)
+    found = thesis_changes(visits.reference, visits.later, config, same_frame=visits.same_frame)
+    return replace(found, warnings=visits.warnings)
 
 
 def write_thesis_changes(
@@ -182,7 +183,9 @@ def thesis_page(found: ThesisChanges, shown: Shown, names: tuple[str, str]) -> s
     return html.document(
         title,
         [
-            html.header("graphslam changes --method thesis", title, note, facts.items(), []),
+            html.header(
+                "graphslam changes --method thesis", title, note, facts.items(), found.warnings
+            ),
             html.section("Chapter 5", html.figure_grid(figures)),
             html.section("Regions", html.table(["region", "at x, y, m", "size, m", "beams"], rows)),
             html.details("Gate", f"<pre>d² &gt; {escape(f'{found.gate:.3f}')}, 2 dof</pre>"),

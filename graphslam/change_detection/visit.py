@@ -1,7 +1,7 @@
 """One visit: the scans that a result folder was made from, with the laser poses it estimated."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ class Visit:
         surface: (n,) whether the return is on a surface, see `on_surface`.
         landmarks: the map of the run.
         robots: number of robots that the scans come from.
+        names: (s,) the robot of each scan; empty if unknown.
+        recordings: robot -> SHA-256 of the recordings that hold its scans; empty if unknown.
     """
 
     stamps_ns: Ints
@@ -54,6 +56,8 @@ class Visit:
     surface: Bools
     landmarks: tuple[Landmark, ...]
     robots: int = 1
+    names: tuple[str, ...] = ()
+    recordings: Mapping[str, frozenset[str]] = field(default_factory=dict)
 
     def headings(self, beams: Bools | Ints | slice = slice(None)) -> Array:
         """Directions (k,) rad of some beams (k,) in the world; default: of all."""
@@ -84,11 +88,42 @@ class Visit:
         """The visit with only the scans (s,) that are True in ``scans``."""
         number = np.cumsum(scans) - 1
         beams = scans[self.scan]
+        names = tuple(name for name, kept in zip(self.names, scans, strict=False) if kept)
         return Visit(
             self.stamps_ns[scans], self.poses[scans], self.covs[scans], self.shared[scans],
             number[self.scan[beams]], self.angle[beams], self.range_m[beams], self.surface[beams],
-            self.landmarks, self.robots,
+            self.landmarks, len(set(names)) or self.robots, names, self.recordings,
         )  # fmt: skip
+
+    def with_shown_landmarks(self) -> "Visit":
+        """The visit without landmarks that none of its scans can show: seen at other times only."""
+        times = np.sort(self.stamps_ns)
+        shown = tuple(
+            one
+            for one in self.landmarks
+            if np.searchsorted(times, one.first_ns) < np.searchsorted(times, one.last_ns, "right")
+        )
+        return replace(self, landmarks=shown)
+
+    def shared_with(self, other: "Visit") -> Bools:
+        """Which scans (s,) are in another visit too: of one recording, and of one time.
+
+        Times alone do not tell: of two robots, or of two simulated days, they may be the same.
+        """
+        mine, theirs = (
+            {sha256 for name in one.names for sha256 in one.recordings.get(name, ())}
+            for one in (self, other)
+        )
+        common = mine & theirs
+        of_common = [
+            np.array([bool(common & one.recordings.get(name, set())) for name in one.names], bool)
+            for one in (self, other)
+        ]
+        if not common:
+            return np.zeros(len(self.stamps_ns), dtype=bool)
+        return np.asarray(
+            of_common[0] & np.isin(self.stamps_ns, other.stamps_ns[of_common[1]]), dtype=bool
+        )
 
 
 def visit_from_scans(
@@ -201,7 +236,12 @@ def load_visit(saved: SavedResult, directory: Path, config: ChangesConfig = _DEF
     unseen = set(saved.summary.get("known_map", {}).get("unseen", ()))
     landmarks = tuple(one for one in saved.landmarks if one.id not in unseen)
     visit = visit_from_scans(stamps, np.array(poses), np.array(covs), sweeps, landmarks, config)
-    return replace(visit, robots=len({name for name, _ in laser_poses}))
+    names = tuple(scan.robot for scan in scans)
+    recordings = {
+        name: frozenset(one.sha256 for one in log.recordings_of(name)) for name in set(names)
+    }
+    robots = len({name for name, _ in laser_poses})
+    return replace(visit, robots=robots, names=names, recordings=recordings)
 
 
 def select_time_span(visit: Visit, span_s: tuple[float, float], what: str) -> Visit:

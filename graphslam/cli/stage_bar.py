@@ -17,7 +17,8 @@ from graphslam.cli import terminal
 from graphslam.core.stages import listening
 
 #: what is done by the begin of a stage, as a share of the work that follows the opening; measured
-#: with default settings on Intel and ACES (scans), MRCLAM 6 (sightings) and Victoria Park (steps).
+#: with default settings on Intel and ACES (scans), four days in the simulated office (sessions),
+#: MRCLAM 6 (sightings) and Victoria Park (steps).
 #: Stages that alternate with reading are not among them
 PLANS = {
     "scans": {
@@ -27,6 +28,14 @@ PLANS = {
         "causal": 0.8,
         "trajectories": 0.81,
         "report": 0.91,
+    },
+    "sessions": {
+        "reading": 0.0,
+        "joining": 0.12,
+        "final optimisation": 0.85,
+        "final": 0.9,
+        "trajectories": 0.97,
+        "report": 0.98,
     },
     "sightings": {
         "reading": 0.0,
@@ -43,11 +52,12 @@ PLANS = {
     },
 }
 #: stages by which a plan is recognised; before one is heard it is that of sightings
-_TELLING = {"tracking": "scans", "front end": "steps"}
+_TELLING = {"sessions": "sessions", "tracking": "scans", "front end": "steps"}
 #: stages that are shown, and their words where these are others
 SHOWN = {
     "opening": "opening",
     "reading": "reading",
+    "joining": "joining sessions",
     "final optimisation": "final optimisation",
     "final": "covariances",
     "causal": "causal",
@@ -57,6 +67,11 @@ SHOWN = {
 #: share and s below which nothing can be said about the end
 _KNOWN, _KNOWN_S = 0.1, 2.0
 _TICK_S = 0.5
+
+
+def _read_share(plan: str) -> float:
+    """Share of the work that is done when all is read: the begin of the next stage."""
+    return list(PLANS[plan].values())[1]
 
 
 class Stages:
@@ -81,18 +96,19 @@ class Stages:
             self._again()
         self._messages = done
         read = min(done / max(total, 1), 1.0) if total else 0.0
-        last = PLANS[self._plan]["final optimisation"]
+        last = _read_share(self._plan)
         # sightings are read in no time, and what follows does not depend on how fast that was
         self._enter("reading", 0.0 if self._plan == "sightings" else last * read, last)
 
     def announced(self, stage: str) -> None:
         """A stage begins; those that are no stage of the whole job are passed over."""
         plan = _TELLING.get(stage)
-        if plan and plan != self._plan:
+        # each session is read and tracked as a log of scans is
+        if plan and self._plan not in (plan, "sessions"):
             if self.stage not in ("opening", "reading"):
                 self._again()
             self._plan = plan
-            self._enter("reading", self._share, PLANS[plan]["final optimisation"])
+            self._enter("reading", self._share, _read_share(plan))
         elif stage in PLANS[self._plan]:
             begins = PLANS[self._plan][stage]
             later = [share for share in PLANS[self._plan].values() if share > begins]

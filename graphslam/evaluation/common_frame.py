@@ -1,12 +1,14 @@
 """Whether a result and its truth are in one world frame, and the move between them if not.
 
-Without a given start the world's origin is the first pose of the first robot. The truth of most
+Without a given start the world's origin is the first pose of the first robot, or that of a known
+map. The truth of most
 recordings is in a frame of its own, in which that pose is somewhere else: then absolute errors and
 their NEES are of the frames, not of the estimate.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -37,23 +39,34 @@ class Alignment:
     by: str
 
 
-def is_start_given(config: Config) -> bool:
-    """Whether the frame of the estimate is one that the user knows."""
-    return config.start.from_truth or bool(config.start.poses)
+def is_world_given(config: Config, summary: Mapping[str, Any]) -> bool:
+    """Whether the world frame of a result is one that the user knows.
 
-
-def is_common_frame(config: Config, pairs: Mapping[str, PosePairs], world: str | None) -> bool:
-    """Whether estimated and true poses are meant to be in one frame.
-
-    They are if a start was given, or if the pose that defines the estimate's frame is where the
-    truth has it.
+    It is if a start was given. In a known map a start is in the frame of the map, which nobody
+    knows unless a start was given to the log by which the map began. One sample of the truth says
+    that the truth is in that frame too.
 
     Args:
         config: settings of the result.
+        summary: of the result.
+    """
+    if config.known_map.directory and not config.start.from_truth:
+        return bool(summary.get("known_map", {}).get("world_given", False))
+    return config.start.from_truth or bool(config.start.poses)
+
+
+def is_common_frame(given: bool, pairs: Mapping[str, PosePairs], world: str | None) -> bool:
+    """Whether estimated and true poses are meant to be in one frame.
+
+    They are if the world was given, or if the pose that defines the estimate's frame is where the
+    truth has it.
+
+    Args:
+        given: see `is_world_given`.
         pairs: final poses of robots in the world frame, at least one.
         world: the robot whose start defines it, if known.
     """
-    if is_start_given(config):
+    if given:
         return True
     first = pairs[world if world is not None and world in pairs else min(pairs)]
     cov = np.diag(np.square(TRUTH_SIGMA))

@@ -19,7 +19,7 @@ from graphslam.evaluation.common_frame import (
     changes_matches,
     displacement_of_poses,
     is_common_frame,
-    is_start_given,
+    is_world_given,
     moved_landmarks,
 )
 from graphslam.evaluation.error_statistics import NEES_NUMBERS, with_joint_bounds
@@ -68,13 +68,12 @@ def evaluate(
     """
     found: dict[str, Any] = {}
     alignment = None
+    given = is_world_given(result.config, result.summary)
     if truth:
         pairs = _pair_all(result, truth)
         own_frame = robots_in_own_frame(result.summary)
         in_world = {n: both["final"] for n, both in pairs.items() if n not in own_frame}
-        common = not in_world or is_common_frame(
-            result.config, in_world, result.summary.get("world")
-        )
+        common = not in_world or is_common_frame(given, in_world, result.summary.get("world"))
         found["common_frame"] = common
         robots = list(in_world.values())
         if robots:
@@ -85,7 +84,7 @@ def evaluate(
     if true_landmarks:
         placed = [landmark for landmark in result.landmarks if landmark.frame is None]
         if "common_frame" not in found:
-            found["common_frame"] = is_start_given(result.config) or not placed
+            found["common_frame"] = given or not placed
             if not found["common_frame"]:
                 alignment = alignment_of_landmarks(placed, true_landmarks)
                 found["common_frame"] = not (

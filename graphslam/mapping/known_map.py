@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.records import Landmark
@@ -30,7 +31,8 @@ class KnownMap:
     ``name`` of the result that it is of, ``sha256`` of its content. ``landmarks``: all of them;
     ``known``: their joint Gaussian as a day sees them, each wall with an error of its own across
     it, of sigma ``bias_m``. ``places``: submaps at poses in the world. ``parents``: the maps that
-    it continues, the first one first, name and sha256 each.
+    it continues, the first one first, name and sha256 each. ``is_world_given``: whether its world
+    frame was told by a start, and not only the first pose of a robot.
     """
 
     name: str
@@ -40,6 +42,7 @@ class KnownMap:
     places: tuple[SubmapPose, ...]
     bias_m: float = 0.0
     parents: tuple[tuple[str, str], ...] = ()
+    is_world_given: bool = False
 
     @property
     def ancestry(self) -> tuple[tuple[str, str], ...]:
@@ -77,14 +80,19 @@ def latest_places(submaps: Sequence[SubmapPose]) -> tuple[SubmapPose, ...]:
         if not (near & (np.abs(wrap(off[:, 2])) < SAME_PLACE_RAD)).any():
             kept.append(k)
     return tuple(
-        map_place(n, submaps[k].pose, submaps[k].submap.poses, submaps[k].submap.clouds)
-        for n, k in enumerate(kept)
+        map_place(n, one.pose, one.submap.poses, one.submap.clouds, one.submap.config)
+        for n, one in enumerate(submaps[k] for k in kept)
     )
 
 
-def map_place(number: int, pose: Array, poses: Array, clouds: Sequence[Array]) -> SubmapPose:
-    """Place ``number`` of a map at ``pose`` (3,): scans ``clouds`` from ``poses`` (k, 3) in it."""
+def map_place(
+    number: int, pose: Array, poses: Array, clouds: Sequence[Array], config: ScanMatchingConfig
+) -> SubmapPose:
+    """Place ``number`` of a map at ``pose`` (3,): scans ``clouds`` from ``poses`` (k, 3) in it.
+
+    It is matched by ``config``.
+    """
     # places have no path; negative times put them before everything that is new
     time_ns = number - 1_000_000_000
-    submap = make_submap(poses, clouds)
+    submap = make_submap(poses, clouds, config)
     return SubmapPose((MAP_ROBOT, time_ns), pose, 0.0, (time_ns, time_ns), submap)

@@ -28,6 +28,8 @@ from graphslam.core.geometry import (
     compose,
     inverse,
     rotation3,
+    transform,
+    unit_vectors,
     wrap,
 )
 from graphslam.mapping.loop_closure import COV_INFLATION, verify_match
@@ -39,7 +41,7 @@ from graphslam.multi_robot.place_search import (
     search_poses,
 )
 from graphslam.multi_robot.relative_frames import RelativeFrame, evenly_spaced
-from graphslam.perception.scan_matching import IntArray, Match, match
+from graphslam.perception.scan_matching import IntArray, Match, match, match_pairs
 
 #: submaps of a robot that are searched for at most
 MAX_SUBMAPS = 80
@@ -128,14 +130,23 @@ def match_places(
     found = []
     for k in evenly_spaced(np.arange(len(places_b)), MAX_SUBMAPS):
         submap = places_b[k].submap
-        for pose in search_poses(spectrum, submap.points, config.place_range_m):
-            verified = []
-            for j in nearest_of_each_pass(positions, pose):
-                guess = between(places_a[j].pose, pose)
-                best = verify_match(match(submap, places_a[j].submap, guess, window))
-                if best is not None:
-                    verified.append(PlaceMatch(j, int(k), best))
-            best_match = max(verified, key=lambda m: m.score, default=None)
+        poses = search_poses(spectrum, submap.points, config.place_range_m)
+        pairs = [
+            (n, j) for n, pose in enumerate(poses) for j in nearest_of_each_pass(positions, pose)
+        ]
+        # all at once: most of the time of a single pair is not in its points
+        matched = match_pairs(
+            [submap] * len(pairs),
+            [places_a[j].submap for _, j in pairs],
+            [between(places_a[j].pose, poses[n]) for n, j in pairs],
+            [window] * len(pairs),
+        )
+        verified: list[list[PlaceMatch]] = [[] for _ in poses]
+        for (n, j), matches in zip(pairs, matched, strict=True):
+            if (best := verify_match(matches)) is not None:
+                verified[n].append(PlaceMatch(j, int(k), best))
+        for own in verified:
+            best_match = max(own, key=lambda m: m.score, default=None)
             if best_match is not None and best_match.score > 0:
                 found.append(best_match)
     return found
@@ -188,8 +199,8 @@ def choose_alignment(
     )
     if min(extents) < config.min_place_extent_m:
         return (
-            f"the places that {a} and {b} have in common extend over less than "
-            "multi_robot.min_place_extent_m"
+            f"the places that {a} and {b} have in common extend over {min(extents):.1f} m only, "
+            f"{alike(min(extents))}"
         )
     # a match with a clearly lower score at its place does not speak for another alignment
     best_score = {found[k].index_b: scores[k] for k in best}
@@ -332,6 +343,27 @@ def consensus(starts: Array, covs: Array, members: IntArray) -> Consensus:
     pose = reference + fit.x
     pose[2] = wrap(pose[2])
     return Consensus(pose, fit.cov, d2)
+
+
+def alike(extent_m: float) -> str:
+    """Why places that extend over so little, m, are not enough, and what accepts them."""
+    accepted = max(np.floor(20.0 * extent_m) / 20.0 - 0.05, 0.0)
+    return f"and rooms look alike (--set multi_robot.min_place_extent_m={accepted:.3g} accepts it)"
+
+
+def seen_extent(*maps: Sequence[SubmapPose]) -> float:
+    """The longest distance, m, between any two points that are seen from places of one map."""
+    return max(map(_seen_extent, maps))
+
+
+def _seen_extent(places: Sequence[SubmapPose]) -> float:
+    points = np.concatenate(
+        [np.zeros((0, 2)), *(transform(place.pose, place.submap.points) for place in places)]
+    )
+    if not len(points):
+        return 0.0
+    across = points @ unit_vectors(np.linspace(0.0, np.pi, 36, endpoint=False)).T
+    return float(np.ptp(across, axis=0).max())
 
 
 def extent(places: Sequence[SubmapPose]) -> float:

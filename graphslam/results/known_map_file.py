@@ -11,13 +11,14 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
-from graphslam.core.config import Config
+from graphslam.core.config import Config, ScanMatchingConfig
 from graphslam.core.errors import ConfigError, OutputError
 from graphslam.core.geometry import Array, rotation3
 from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
@@ -43,15 +44,20 @@ FORMAT = 1
 KNOWN_MAP_FILE = "known_map.npz"
 
 
-def load_known_map(directory: Path) -> KnownMap:
+def load_known_map(directory: Path, matching: ScanMatchingConfig | None = None) -> KnownMap:
     """The map that a result folder holds for later logs.
+
+    Args:
+        directory: of the result.
+        matching: how later scans are matched with its places; default settings without it.
 
     Raises:
         OutputError: it is no result folder, or one that cannot be used as a map: the line says why.
         ConfigError: its config.toml is not valid.
     """
+    matching = matching or ScanMatchingConfig()
     if (directory / KNOWN_MAP_FILE).exists():
-        return _read(directory / KNOWN_MAP_FILE, directory.absolute().name)
+        return _read(directory / KNOWN_MAP_FILE, directory.absolute().name, matching)
     saved = load(directory)
     if saved.summary["format"] != RESULT_FORMAT:
         raise OutputError(
@@ -80,9 +86,10 @@ def load_known_map(directory: Path) -> KnownMap:
     cov = landmark_covariance(saved.joint, landmarks, biases=False)
     cov = with_surface_biases(landmarks, cov, bias_m)
     known = known_landmarks(landmarks, cov)
-    places = latest_places(_submaps(directory, saved))
+    places = latest_places(_submaps(directory, saved, matching))
     name, sha256 = directory.absolute().name, _digest(directory)
-    return KnownMap(name, sha256, landmarks, known, places, bias_m)
+    given = saved.config.start.from_truth or bool(saved.config.start.poses)
+    return KnownMap(name, sha256, landmarks, known, places, bias_m, is_world_given=given)
 
 
 def known_map_of(config: Config) -> KnownMap | None:
@@ -98,7 +105,7 @@ def known_map_of(config: Config) -> KnownMap | None:
                 "known_map.update (--update): there is no map to continue; give --prior-map DIR"
             )
         return None
-    return load_known_map(Path(config.known_map.directory))
+    return load_known_map(Path(config.known_map.directory), config.scan_matching)
 
 
 def known_map_files(result: Result, earlier: KnownMap | None) -> list[tuple[str, bytes]]:
@@ -129,7 +136,9 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
     found = build_submaps(result.estimate.states, result.keyframe_scans, result.config)
     places = latest_places([*found, *earlier.places])
     # named by its folder, identified by its content
-    return KnownMap("", "", landmarks, known, places, bias_m, earlier.ancestry)
+    return KnownMap(
+        "", "", landmarks, known, places, bias_m, earlier.ancestry, earlier.is_world_given
+    )
 
 
 def landmark_covariance(
@@ -181,7 +190,7 @@ def known_landmarks(landmarks: Sequence[Landmark], cov: Array) -> KnownLandmarks
     return KnownLandmarks(means, tuple(means), root)
 
 
-def _submaps(directory: Path, saved: SavedResult) -> list[SubmapPose]:
+def _submaps(directory: Path, saved: SavedResult, matching: ScanMatchingConfig) -> list[SubmapPose]:
     """Submaps along the paths of a result."""
     placed = read_scans(directory / SCANS_FILE)
     states: dict[str, Trajectory] = {}
@@ -191,7 +200,7 @@ def _submaps(directory: Path, saved: SavedResult) -> list[SubmapPose]:
         poses = np.array([scan.pose for scan in own])
         states[robot] = Trajectory(times, poses, np.full((len(own), 3, 3), np.nan))
     scans = [KeyframeScan(s.robot, s.time_ns, s.points, s.sensor) for s in placed]
-    return build_submaps(states, scans, saved.config)
+    return build_submaps(states, scans, replace(saved.config, scan_matching=matching))
 
 
 def _digest(directory: Path) -> str:
@@ -223,6 +232,7 @@ def known_map_bytes(known: KnownMap) -> bytes:
         "rows": np.concatenate([np.zeros(0), *(row.ravel() for row in root.rows)]),
         "widening": np.array(root.widening),
         "bias_m": np.array(known.bias_m),
+        "is_world_given": np.array(known.is_world_given),
         "place_pose": np.array([p.pose for p in known.places]).reshape(-1, 3),
         "place_scans": np.array([len(p.submap.clouds) for p in known.places], dtype=np.int32),
         "sensor": np.concatenate([np.zeros((0, 3)), *(p.submap.poses for p in known.places)]),
@@ -234,7 +244,7 @@ def known_map_bytes(known: KnownMap) -> bytes:
     return made.getvalue()
 
 
-def _read(path: Path, name: str) -> KnownMap:
+def _read(path: Path, name: str, matching: ScanMatchingConfig) -> KnownMap:
     try:
         data = path.read_bytes()
         with np.load(BytesIO(data)) as file:
@@ -244,12 +254,14 @@ def _read(path: Path, name: str) -> KnownMap:
                 f"{path}: is of format {int(arrays['format'])}, this version reads {FORMAT}; "
                 "smooth its logs again"
             )
-        return _known_map(arrays, name, hashlib.sha256(data).hexdigest())
+        return _known_map(arrays, name, hashlib.sha256(data).hexdigest(), matching)
     except (OSError, ValueError, KeyError, IndexError, BadZipFile) as error:
         raise OutputError(f"{path}: {error}") from error
 
 
-def _known_map(arrays: Mapping[str, Array], name: str, sha256: str) -> KnownMap:
+def _known_map(
+    arrays: Mapping[str, Array], name: str, sha256: str, matching: ScanMatchingConfig
+) -> KnownMap:
     landmarks = tuple(map(landmark_from_json, json.loads(arrays["landmarks"].tobytes())))
     means = {mark.id: mark.position[: 2 if mark.kind == "point" else 3] for mark in landmarks}
     dims = [len(mean) for mean in means.values()]
@@ -269,14 +281,15 @@ def _known_map(arrays: Mapping[str, Array], name: str, sha256: str) -> KnownMap:
     clouds = np.split(arrays["points"].astype(float), np.cumsum(arrays["count"])[:-1])
     first = np.concatenate([[0], np.cumsum(arrays["place_scans"])]).tolist()
     places = tuple(
-        map_place(
-            k, pose, arrays["sensor"][first[k] : first[k + 1]], clouds[first[k] : first[k + 1]]
+        map_place(k, pose, arrays["sensor"][begin:end], clouds[begin:end], matching)
+        for k, (pose, (begin, end)) in enumerate(
+            zip(arrays["place_pose"], pairwise(first), strict=True)
         )
-        for k, pose in enumerate(arrays["place_pose"])
     )
     known = KnownLandmarks(means, tuple(means), root)
     told = tuple((str(a), str(b)) for a, b in arrays["parents"])
     if str(arrays["name"]):  # a copy
         name, sha256 = str(arrays["name"]), str(arrays["sha256"])
     bias_m = float(arrays.get("bias_m", 0.0))  # of older ones it is not known
-    return KnownMap(name, sha256, landmarks, known, places, bias_m, told)
+    given = bool(arrays.get("is_world_given", False))
+    return KnownMap(name, sha256, landmarks, known, places, bias_m, told, given)

@@ -22,7 +22,7 @@ from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.submaps import SubmapPose, submaps_at, with_poses_from
 from graphslam.multi_robot.hypothesis_choice import best_explanation, contradiction, doubt
 from graphslam.multi_robot.map_localisation import Support, hypotheses, support
-from graphslam.multi_robot.place_recognition import PlaceMap
+from graphslam.multi_robot.place_recognition import PlaceMap, seen_extent
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.slam.log_pass import timed
 from graphslam.slam.path_closing import PLACE_COV, ClosedPaths, close_paths
@@ -155,10 +155,12 @@ def found_start(
         found.append((laid_start(laid, robot), laid))
     why = "no place in it is recognised"
     if supports:
-        best, why = best_explanation(supports, own.places, scan_log.config.multi_robot)
-        if not why:
+        seen_m = seen_extent(known_map.places, own.places)
+        best, refusal = best_explanation(supports, own.places, scan_log.config.multi_robot, seen_m)
+        if refusal is None:
             scan_log.map_doubt = doubt(supports[best], own.places, scan_log.config.loop_closure)
             return found[best]
+        why = refusal.text
     raise EstimationError(
         f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; give "
         f"another map, or {start_option(robot)} (m, rad)"

@@ -6,14 +6,14 @@ map (`localisation`): the relative pose of the two is a hypothesis that lays all
 the map of the other. Most of their places must confirm it, few contradict it, and it may have no
 rival. What was moved between two sessions costs a few places; a corridor that is taken for another
 one is contradicted all over the building. More may have been moved where nearly all places are
-recognised and nothing else explains any: that all is of one place was said. Groups grow, and what
-was refused with less in common is tried again. A group that is refused in the end has a frame of
-its own.
+recognised and nothing else explains any: that all is of one place was said. Groups grow, and
+what was refused with less in common is tried again (`next_pair`). A group that is refused in the
+end has a frame of its own.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from functools import cached_property
 
 import numpy as np
 
@@ -27,9 +27,15 @@ from graphslam.logs import LogSet
 from graphslam.mapping.known_map import KnownMap, latest_places
 from graphslam.mapping.submaps import SubmapPose, with_poses_from
 from graphslam.multi_robot.frame_tree import FrameAssignment
-from graphslam.multi_robot.hypothesis_choice import best_explanation, contradiction, doubt
+from graphslam.multi_robot.hypothesis_choice import (
+    Refusal,
+    Telling,
+    best_explanation,
+    contradiction,
+    doubt,
+)
 from graphslam.multi_robot.map_localisation import Support, support
-from graphslam.multi_robot.place_recognition import PlaceMap
+from graphslam.multi_robot.place_recognition import PlaceMap, seen_extent
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.slam.localisation import (
@@ -43,6 +49,10 @@ from graphslam.slam.start_priors import origin, start_poses
 
 #: a map of sessions has places only
 _NO_LANDMARKS = KnownLandmarks({}, (), SparseRoot((), (), 1.0))
+#: two groups that were refused are tried again once both have so many times the places together
+GROWN = 1.1
+#: hypotheses about a group that are judged at most; one session has 5 and a few symmetric ones
+MAX_LAID = 10
 
 
 def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) -> FrameAssignment:
@@ -66,7 +76,7 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
     doubted = _check_given(placed, tracked)
     groups = [_group(placed, tracked)]
     groups += [_group({n: origin(config)}, tracked) for n in by_time if n not in given]
-    refused = _merge(groups, tracked, config)
+    refused = merge(groups, tracked, config)
     starts, frames, found = dict(given), dict.fromkeys(given, world), {}
     remarks = dict(doubted)
     for group in groups:
@@ -92,10 +102,10 @@ def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"])
     before: dict[str, Start] = {}
     doubted: dict[str, str] = {}
     for name, start in given.items():
-        known = _group(before, sessions).map
-        if known.places:
+        group = _group(before, sessions)
+        if group.map.places:
             session = sessions[name]
-            placed = _lay({name: start}, known, sessions).support
+            placed = group.lay({name: start}, sessions).support
             why = contradiction(placed)
             if why:
                 raise EstimationError(
@@ -151,23 +161,63 @@ class _Session:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Laid:
+    """A group laid into a map as a hypothesis says: starts and places there, and their support."""
+
+    starts: Mapping[str, Start]
+    places: Sequence[SubmapPose]
+    support: Support
+
+
+@dataclass(frozen=True, eq=False)
 class _Group:
     """Sessions whose relative starts are known.
 
     ``starts`` in the frame of the group, the leader's first; ``seen``: places that they saw, the
     latest session first; ``confirmed``: how many places confirmed the start of each; ``remarks``
-    about it.
+    about it. What was found of other sessions in its map is kept: alone they are refused, and as a
+    group tried again.
     """
 
     starts: Mapping[str, Start]
     seen: Sequence[SubmapPose]
     confirmed: Mapping[str, float]
     remarks: Mapping[str, str] = field(default_factory=dict)
+    _found: dict[str, list[Start]] = field(default_factory=dict, repr=False)
+    _laid: dict[tuple[str, bytes], tuple[Start, list[SubmapPose]]] = field(
+        default_factory=dict, repr=False
+    )
 
     @property
+    def leader(self) -> str:
+        """The session in whose frame it is."""
+        return next(iter(self.starts))
+
+    @cached_property
     def map(self) -> KnownMap:
         """Its places."""
         return KnownMap("", "", (), _NO_LANDMARKS, latest_places(self.seen))
+
+    def possible_starts(self, session: _Session) -> list[Start]:
+        """Where another session may begin in it, the best supported start first."""
+        name = session.name
+        if name not in self._found:
+            self._found[name] = possible_starts(session.log, name, self.map, session.own)
+        return self._found[name]
+
+    def lay(self, starts: Mapping[str, Start], sessions: Mapping[str, _Session]) -> _Laid:
+        """Every session closed with its places from its start in it."""
+        found, places = {}, []
+        for name, start in starts.items():
+            key = name, np.concatenate([start.pose, start.cov.ravel()]).tobytes()
+            if key not in self._laid:
+                session = sessions[name]
+                laid = laid_into(session.log, name, start, self.map)
+                own = with_poses_from(session.own.places, laid.states)
+                self._laid[key] = laid_start(laid, name), own
+            found[name], own = self._laid[key]
+            places += own
+        return _Laid(found, places, support(self.map.places, places))
 
 
 def _group(starts: Mapping[str, Start], sessions: Mapping[str, _Session]) -> _Group:
@@ -176,48 +226,73 @@ def _group(starts: Mapping[str, Start], sessions: Mapping[str, _Session]) -> _Gr
     return _Group(starts, seen, {})
 
 
-def _merge(
-    groups: list[_Group], sessions: Mapping[str, _Session], config: Config
-) -> dict[str, str]:
+def merge(groups: list[_Group], sessions: Mapping[str, _Session], config: Config) -> dict[str, str]:
     """Join groups as long as two can be joined, the earlier ones first.
 
     Returns:
-        Why the sessions of each group that was tried and not joined are not known: leader -> why.
+        Why the sessions of each group that was tried and not joined are not known: leader -> why,
+        and in whose map.
     """
-    refused: dict[str, str] = {}
-    tried: set[tuple[frozenset[str], frozenset[str]]] = set()
-    while True:
-        for one, other in combinations(groups, 2):
-            pair = frozenset(one.starts), frozenset(other.starts)
-            if pair in tried:
-                continue
-            tried.add(pair)
-            joined = _joined(one, other, sessions, config)
-            if isinstance(joined, _Group):
-                groups[groups.index(one)] = joined
-                groups.remove(other)
-                break
-            refused[next(iter(other.starts))] = joined
-        else:
-            return refused
+    tried: dict[tuple[str, str], int] = {}
+    refused: dict[str, dict[str, Refusal]] = {group.leader: {} for group in groups}
+    while pair := next_pair(groups, tried):
+        one, other = pair
+        joined = _joined(one, other, sessions, config)
+        if isinstance(joined, _Group):
+            groups[groups.index(one)] = joined
+            groups.remove(other)
+            for reasons in refused.values():
+                reasons.pop(other.leader, None)
+            continue
+        text = f"in the map of {' and '.join(one.starts)}: {joined.text}"
+        refused[other.leader][one.leader] = replace(joined, text=text)
+    # of equally telling ones the first, which is of the group that was there before
+    return {
+        leader: max(reasons.values(), key=lambda why: why.telling).text
+        for leader, reasons in refused.items()
+        if reasons
+    }
+
+
+def next_pair(
+    groups: Sequence[_Group], tried: dict[tuple[str, str], int]
+) -> tuple[_Group, _Group] | None:
+    """The next two groups to be tried; None if there are none.
+
+    With each group first what was never tried with it, so that it has grown when the others, which
+    were refused with less in common, are tried again. They are only if clearly more of the place is
+    known: else n sessions would be compared n² times with what hardly changed.
+
+    Args:
+        groups: that there are now.
+        tried: leaders of two groups -> places of both when they were tried; this pair is added.
+    """
+    for k, one in enumerate(groups):
+        sizes = {
+            other.leader: len(one.map.places) + len(other.map.places) for other in groups[k + 1 :]
+        }
+        last = {leader: tried.get((one.leader, leader)) for leader in sizes}
+        fresh = [name for name, before in last.items() if before is None]
+        grown = [n for n, before in last.items() if before and sizes[n] >= GROWN * before]
+        for other in groups[k + 1 :]:
+            if other.leader == next(iter([*fresh, *grown]), None):
+                tried[one.leader, other.leader] = sizes[other.leader]
+                return one, other
+    return None
 
 
 def _joined(
     one: _Group, other: _Group, sessions: Mapping[str, _Session], config: Config
-) -> _Group | str:
+) -> _Group | Refusal:
     """Both groups in the frame of the first one, or why their relative pose is not known."""
-    known = one.map
-    laid: list[_Laid] = []
-    for name, start in other.starts.items():
-        session = sessions[name]
-        for found in possible_starts(session.log, name, known, session.own):
-            moved = {n: _carried(found, start, s) for n, s in other.starts.items()}
-            if not any(_is_same(lies.starts, moved) for lies in laid):
-                laid.append(_lay(moved, known, sessions))
+    laid = [one.lay(starts, sessions) for starts in _hypotheses(one, other, sessions)]
     if not laid:
-        return "no place of the others is recognised"
+        return Refusal("no place is recognised", Telling.NOTHING)
     places = [place for name in other.starts for place in sessions[name].own.places]
-    index, why = best_explanation([one.support for one in laid], places, config.multi_robot)
+    own = [place for name, start in other.starts.items() for place in sessions[name].at(start)]
+    seen_m = seen_extent(one.map.places, own)
+    supports = [found.support for found in laid]
+    index, why = best_explanation(supports, places, config.multi_robot, seen_m)
     best = laid[index]
     if why:
         return why
@@ -233,13 +308,26 @@ def _joined(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Laid:
-    """A group laid into a map as a hypothesis says: starts and places there, and their support."""
+def _hypotheses(
+    one: _Group, other: _Group, sessions: Mapping[str, _Session]
+) -> list[dict[str, Start]]:
+    """Where the sessions of a group may begin in the map of another, as one.
 
-    starts: Mapping[str, Start]
-    places: Sequence[SubmapPose]
-    support: Support
+    Each session has hypotheses of its own, which put all into the map. Those that most sessions
+    have come first, and the rest of many is left out: each costs as much as there are sessions.
+    """
+    found: list[tuple[int, int, dict[str, Start]]] = []
+    for name, start in other.starts.items():
+        for rank, at in enumerate(one.possible_starts(sessions[name])):
+            moved = {n: _carried(at, start, s) for n, s in other.starts.items()}
+            same = next((k for k, (*_, have) in enumerate(found) if _is_same(have, moved)), None)
+            if same is None:
+                found.append((-1, rank, moved))
+            else:
+                votes, best, have = found[same]
+                found[same] = votes - 1, min(best, rank), have
+    found.sort(key=lambda entry: entry[:2])
+    return [moved for *_, moved in found[:MAX_LAID]]
 
 
 def _carried(found: Start, before: Start, start: Start) -> Start:
@@ -254,14 +342,3 @@ def _is_same(one: Mapping[str, Start], other: Mapping[str, Start]) -> bool:
     off = np.array([between(one[name].pose, other[name].pose) for name in one])
     near = np.hypot(off[:, 0], off[:, 1]) < DISTINCT_M
     return bool((near & (np.abs(off[:, 2]) < DISTINCT_RAD)).all())
-
-
-def _lay(starts: Mapping[str, Start], known: KnownMap, sessions: Mapping[str, _Session]) -> _Laid:
-    """Every session closed with the places of a map from its start there."""
-    found, places = {}, []
-    for name, start in starts.items():
-        session = sessions[name]
-        laid = laid_into(session.log, name, start, known)
-        found[name] = laid_start(laid, name)
-        places += with_poses_from(session.own.places, laid.states)
-    return _Laid(found, places, support(known.places, places))

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
+from graphslam.core.stages import announce
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
 from graphslam.mapping.loop_closure import Tamper
@@ -90,6 +91,7 @@ def solve_session_log(
         LogError: no message of the logs could be used.
         EstimationError: the estimate is indeterminate, or a start that is told is malformed.
     """
+    announce("sessions")
     sessions: dict[str, ScanLog] = {}
     first = messages = 0
     for robot in log.robots:
@@ -106,9 +108,12 @@ def solve_session_log(
             first = 1 + max(one.landmarks.entries, default=first - 1)
     if not sessions:
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
-    starts = kept.stage("starts", lambda: join_sessions(log, sessions, config))
+    took = {"joining": 0.0}
+    with timed(took, "joining"):
+        starts = kept.stage("starts", lambda: join_sessions(log, sessions, config))
     known = PriorKnowledge(starts, NO_RECORDED)
     joined = SessionLog(log, config, known, sessions)
+    joined.seconds.update(took)
     with timed(joined.seconds, "final optimisation"):
         estimate = optimise_scan_log(joined, tamper)
     return FinishedPass(joined, estimate, Findings({}, {}, {}), is_settled=True)

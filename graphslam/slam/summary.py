@@ -178,6 +178,7 @@ def known_map_summary(pipeline: LogPass) -> dict[str, Any]:
             "sha256": known_map.sha256,
             "doubt": pipeline.map_doubt,
             "parents": [{"name": name, "sha256": sha256} for name, sha256 in known_map.parents],
+            "world_given": known_map.is_world_given,
             "updated": pipeline.given_config.known_map.update,
             "landmarks": len(earlier),
             "seen": len(earlier & seen),

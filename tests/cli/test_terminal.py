@@ -50,7 +50,9 @@ def test_the_time_left_is_true_of_a_job_whose_stages_take_their_usual_shares(pla
     clock, opening, work = Clock(), 30.0, 50.0
     stages = Stages(clock)
     clock.now = opening
-    stages.announced({"scans": "tracking", "steps": "front end"}.get(plan, "reading"))
+    stages.announced(
+        {"scans": "tracking", "steps": "front end", "sessions": plan}.get(plan, "reading")
+    )
     for stage, begins in list(PLANS[plan].items())[1:]:
         clock.now = opening + work * begins
         stages.announced(stage)
@@ -67,6 +69,23 @@ def test_half_of_the_reading_tells_when_a_job_of_scans_will_end():
     stages.read(50, 100)
     whole = 20.0 / PLANS["scans"]["final optimisation"]
     assert stages.left_s == pytest.approx(whole - 10.0)
+
+
+def test_the_joining_of_sessions_is_a_stage_of_the_work():
+    """It takes most of the time, in which nothing was shown but that reading was nearly done."""
+    clock = Clock()
+    stages = Stages(clock)
+    stages.announced("sessions")
+    for done in (10, 20):
+        stages.announced("tracking")  # of each session
+        clock.now += 5.0
+        stages.read(done, 20)
+    stages.announced("joining")
+    assert stages.stage == "joining"
+    before = stages.done
+    clock.now += 20.0
+    assert before < stages.done < PLANS["sessions"]["final optimisation"]
+    assert stages.left_s is not None
 
 
 def test_a_log_that_is_read_anew_is_planned_anew_and_the_bar_does_not_go_back():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic_results import orchard, room
 
-from graphslam.core.config import StartConfig
+from graphslam.core.config import KnownMapConfig, StartConfig
 from graphslam.core.geometry import compose, transform
 from graphslam.core.records import Trajectory, TrueLandmark
 from graphslam.evaluation.common_frame import places
@@ -78,6 +78,20 @@ def test_a_start_that_was_given_is_believed(garden):
         assert found["common_frame"]
         assert found["joint"]["final"]["ate_rmse_m"] > 10
         assert found["joint"]["final"]["nees_verdict"] == "too confident"
+
+
+def test_a_start_in_a_known_map_says_nothing_about_the_truth(garden):
+    """It is in the frame of the map: that is the truth's only if the map was begun by a start."""
+    result, truths, _ = garden
+    start = StartConfig(poses={"a": (0.0, 0.0, 0.0)})
+    in_map = replace(result.config, start=start, known_map=KnownMapConfig("monday"))
+    for given in (False, True):
+        summary = {**result.summary, "known_map": {"world_given": given}}
+        found = evaluate(replace(result, config=in_map, summary=summary), moved(truths))
+        assert found["common_frame"] == given
+        assert (found["joint"]["final"]["ate_rmse_m"] is None) != given
+    sampled = replace(in_map, start=StartConfig(from_truth=True))
+    assert evaluate(replace(result, config=sampled), moved(truths))["common_frame"]
 
 
 @pytest.mark.parametrize("names", [True, False])

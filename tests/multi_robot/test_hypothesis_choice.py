@@ -1,5 +1,6 @@
 """Which of several hypotheses about a path in a map is believed."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -44,7 +45,7 @@ def test_the_best_is_taken_where_others_are_contradicted():
 )
 def test_a_rival_leaves_it_undecided(rival):
     """The right one of two may be the one that furniture contradicts."""
-    assert "more than one way" in chosen(hypothesis(0.9, 0), rival)
+    assert "more than one way" in chosen(hypothesis(0.9, 0), rival).text
 
 
 def test_another_beginning_of_one_path_is_no_rival():
@@ -55,10 +56,41 @@ def test_another_beginning_of_one_path_is_no_rival():
 def test_too_little_is_refused():
     """Few places, places of one room, and places that contradict the map."""
     few = replace(hypothesis(0.9, 0), confirmed=np.arange(6) < 3)
-    assert "only 3 of 6" in chosen(few)
-    wide = MultiRobotConfig(min_place_extent_m=20.0)
-    assert "extend over less" in choose([hypothesis(0.9, 0)], PLACES, wide)
-    assert "3 of 6 places contradict it" in chosen(hypothesis(0.9, 3))
+    assert "only 3 of 6" in chosen(few).text
+    assert (
+        "extend over 15.0 m only"
+        in choose([hypothesis(0.9, 0)], PLACES, MultiRobotConfig(min_place_extent_m=20.0)).text
+    )
+    assert "3 of 6 places contradict it" in chosen(hypothesis(0.9, 3)).text
+
+
+def test_what_accepts_places_that_are_near_each_other_is_named_and_does():
+    """The setting was named without a value, and without how it is given."""
+    near = [SimpleNamespace(pose=pose * [0.17, 1.0, 1.0]) for pose in POSES]
+    refusal = choose([hypothesis(0.9, 0)], near, MultiRobotConfig())
+    (told,) = re.findall(r"--set multi_robot.min_place_extent_m=([0-9.]+) accepts", refusal.text)
+    assert 2.0 < float(told) < 2.55  # of 2.55 m
+    assert choose([hypothesis(0.9, 0)], near, MultiRobotConfig(min_place_extent_m=float(told))) == 0
+
+
+@pytest.mark.parametrize(
+    ("seen_m", "absent", "accepted"),
+    [(6.0, 0.02, True), (6.0, 0.05, False), (7.0, 0.0, False), (np.inf, 0.0, False)],
+)
+def test_a_small_room_is_enough_if_nobody_saw_more_and_nothing_contradicts_it(
+    seen_m, absent, accepted
+):
+    """Places over 2.55 m, 0.4 of 6.4 m. A mirrored room of 4 m contradicts places by 0.05, less
+    than the 0.07 from which a place contradicts; so it would be taken for the same."""
+    near = [SimpleNamespace(pose=pose * [0.17, 1.0, 1.0]) for pose in POSES]
+    one = replace(hypothesis(0.9, 0), absent=np.full(6, absent))
+    for alone in (False, True):
+        chosen = choose([one], near, MultiRobotConfig(), seen_m, may_contradict=alone)
+        if accepted:
+            assert chosen == 0
+        else:
+            assert "rooms look alike (--set" in chosen.text
+    assert choose([one], PLACES, MultiRobotConfig(), seen_m) == 0  # of a building
 
 
 @pytest.mark.parametrize(
@@ -100,17 +132,23 @@ def laid(scores, shift_m=0.0, contradicted=0):
     return Support(LONG + off, scores, scores > 0, np.arange(12) < contradicted, np.zeros(12))
 
 
+def said(found):
+    """Why the best explanation is not believed, if it is not."""
+    refusal = best_explanation(found, LONG_PLACES, CONFIG)[1]
+    return refusal.text if refusal else ""
+
+
 RIGHT = laid([0.8] * 8 + [0] * 4)
 
 
 def test_a_place_that_fits_worse_is_no_evidence_of_a_rival():
     """A building that is turned has walls everywhere too, and more places may see some."""
     turned = laid([0.5] * 12, 20.0)
-    assert best_explanation([turned, laid([0.8] * 12)], LONG_PLACES, CONFIG) == (1, "")
+    assert best_explanation([turned, laid([0.8] * 12)], LONG_PLACES, CONFIG) == (1, None)
     # where most of it fits as well it is undecided
     assert (
         "more than one way"
-        in best_explanation([RIGHT, laid([0.75] * 8 + [0] * 4, 20.0)], LONG_PLACES, CONFIG)[1]
+        in best_explanation([RIGHT, laid([0.75] * 8 + [0] * 4, 20.0)], LONG_PLACES, CONFIG)[1].text
     )
 
 
@@ -118,7 +156,7 @@ def test_what_is_contradicted_all_over_is_not_thebest_explanation():
     """It may explain more than the right one if it puts the drive where the map has more."""
     turned = laid([0.5] * 12, 20.0, contradicted=6)
     found = [turned, laid([0.7] * 8 + [0] * 4)]
-    assert best_explanation(found, LONG_PLACES, CONFIG) == (1, "")
+    assert best_explanation(found, LONG_PLACES, CONFIG) == (1, None)
 
 
 def test_laying_more_of_a_drive_into_the_map_does_not_make_a_rival_of_what_is_contradicted():
@@ -129,10 +167,10 @@ def test_laying_more_of_a_drive_into_the_map_does_not_make_a_rival_of_what_is_co
     best = [0.6] * 8 + [0] * 4
     for contradicted, against, is_rival in ((6, 0, False), (6, 1, False), (4, 2, True)):
         found = [laid(elsewhere, 20.0, contradicted), laid(best, contradicted=against)]
-        assert ("more than one way" in best_explanation(found, LONG_PLACES, CONFIG)[1]) == is_rival
+        assert ("more than one way" in said(found)) == is_rival
     # what it has in common with the best one counts all the same
     found = [laid([0.55] * 8 + [0.9] * 4, 20.0, 6), laid(best)]
-    assert "more than one way" in best_explanation(found, LONG_PLACES, CONFIG)[1]
+    assert "more than one way" in best_explanation(found, LONG_PLACES, CONFIG)[1].text
 
 
 def test_much_may_have_been_moved_where_nothing_else_explains_anything():
@@ -140,18 +178,17 @@ def test_much_may_have_been_moved_where_nothing_else_explains_anything():
     other relative pose explains a tenth as much, as parts of the office turned round do."""
     moved = laid([0.4] * 12, contradicted=10)
     faint, less_faint = (laid([score] * 2 + [0] * 10, 20.0, 2) for score in (0.2, 0.3))
-    assert best_explanation([moved, faint], LONG_PLACES, CONFIG) == (0, "")
+    assert best_explanation([moved, faint], LONG_PLACES, CONFIG) == (0, None)
     for found in ([moved, less_faint], [laid([0.4] * 8 + [0] * 4, contradicted=6)]):
-        assert "places contradict it" in best_explanation(found, LONG_PLACES, CONFIG)[1]
+        assert "places contradict it" in best_explanation(found, LONG_PLACES, CONFIG)[1].text
     # where all are contradicted nothing is explained, and the right pose may be as contradicted
     nothing = Support(
         LONG, np.zeros(12), np.ones(12, dtype=bool), np.ones(12, dtype=bool), np.zeros(12)
     )
     turned = replace(nothing, poses=np.add(LONG, [20.0, 0, 0]), confirmed=np.arange(12) < 7)
     for found in ([nothing], [moved, turned]):
-        assert "places contradict it" in best_explanation(found, LONG_PLACES, CONFIG)[1]
+        assert "places contradict it" in best_explanation(found, LONG_PLACES, CONFIG)[1].text
     # few places, or places of one room, are refused whatever speaks for them
-    assert (
-        "less than multi_robot.min_place_extent_m"
-        in (best_explanation([moved], [SimpleNamespace(pose=np.zeros(3))] * 12, CONFIG)[1])
+    assert "extend over 0.0 m only" in (
+        best_explanation([moved], [SimpleNamespace(pose=np.zeros(3))] * 12, CONFIG)[1].text
     )

@@ -10,11 +10,13 @@ from walls import rectangles
 import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
-from graphslam.core.geometry import rotate_cov, rotation3
+from graphslam.core.geometry import between, rotate_cov, rotation3
+from graphslam.mapping.known_map import latest_places
 from graphslam.mapping.landmark_records import ALONG, SHORTEST_M
 from graphslam.results.folder import JOINT_FILE
 from graphslam.results.known_map_file import (
     KNOWN_MAP_FILE,
+    known_map_of,
     landmark_covariance,
     load_known_map,
 )
@@ -84,6 +86,16 @@ def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):
     # a start that is told decides it
     told = {"start.poses.robot": [7.85, 4.71, 1.97]}
     assert localised(log, tmp_path / "first", **told).summary["known_map"]["seen"] >= 4
+
+
+def test_a_start_is_found_in_a_small_room(tmp_path):
+    """Default settings refused it: places of a room of 7 m cannot extend over 6 m."""
+    room = rectangles((1.3, 1.0, 8.7, 7.0), (1.3, 6.0, 2.5, 7.0), (8.2, 1.0, 8.7, 3.0))
+    known = tmp_path / "first"
+    graphslam.smooth(drive(tmp_path / "first.mcap", room=room), output=known)
+    log = drive(tmp_path / "later.mcap", room=room, phase=0.3, seed=3)
+    result = graphslam.smooth(log, **{"known_map.directory": str(known)})
+    assert graphslam.evaluate(result)["robots"]["robot"]["final"]["ate_aligned_rmse_m"] < 0.03
 
 
 def test_another_building_is_refused_and_nothing_written(tmp_path, first_day):
@@ -206,6 +218,28 @@ def test_what_is_gone_is_retired_and_what_is_new_added(tmp_path, first_day):
     assert any(np.hypot(*(mark.extent.mean(axis=0) - [8.5, 7.0])) < 0.3 for mark in new)
 
 
+def test_a_result_is_judged_in_the_frame_of_its_map(tmp_path, first_day):
+    """A map whose start nobody told is in a frame of its own, and so is what is started in it.
+    Good paths were judged to be metres off."""
+    own = tmp_path / "own"
+    graphslam.smooth(drive(tmp_path / "first.mcap", room=FURNISHED), output=own)
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.3, seed=3)
+    there = between(true_pose(0.0), true_pose(0.0, 0.3))
+    update = {"known_map.update": True}
+    result = localised(
+        log, own, output=tmp_path / "later", **update, **{"start.poses.robot": there.tolist()}
+    )
+    found = graphslam.evaluate(result)
+    assert not found["common_frame"]
+    errors = found["robots"]["robot"]["final"]
+    assert errors["ate_rmse_m"] is None
+    assert errors["ate_aligned_rmse_m"] < 0.03
+    assert not load_known_map(tmp_path / "later").is_world_given
+    assert load_known_map(first_day).is_world_given
+    localised(log, first_day, output=tmp_path / "told", **update)
+    assert load_known_map(tmp_path / "told").is_world_given
+
+
 def test_what_is_no_map_is_one_clear_line(tmp_path, first_day):
     """Folders that are no results, of earlier versions, of later formats; nothing to continue."""
     with pytest.raises(OutputError, match="not a result folder"):
@@ -241,6 +275,22 @@ def test_what_is_no_map_is_one_clear_line(tmp_path, first_day):
     (old / KNOWN_MAP_FILE).write_bytes(b"no archive")
     with pytest.raises(OutputError, match=KNOWN_MAP_FILE):
         load_known_map(old)
+
+
+def test_places_of_a_map_are_matched_by_the_settings_of_the_log(tmp_path, first_day):
+    """Made of a result, read from a file, or of sessions: else only half of the matcher's settings
+    are in force, those of the new scans."""
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.3, seed=3)
+    localised(log, first_day, output=tmp_path / "later")
+    coarse = {"scan_matching.cell_m": 0.1}
+    for folder in (first_day, tmp_path / "later"):
+        config = graphslam.load_config(**{"known_map.directory": str(folder)}, **coarse)
+        places = known_map_of(config).places
+        assert {place.submap.config for place in places} == {config.scan_matching}
+        default = load_known_map(folder).places
+        assert len(places[0].submap.points) < 0.7 * len(default[0].submap.points)
+        again = latest_places(places)
+        assert {place.submap.config for place in again} == {config.scan_matching}
 
 
 def test_the_joint_covariance_has_the_marginals_of_the_landmarks(first_day):
