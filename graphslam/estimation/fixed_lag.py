@@ -34,8 +34,9 @@ from graphslam.estimation.factor_graph import FactorGroup, GraphBackend, GraphBu
 from graphslam.estimation.square_root import Rows, eliminate, stacked
 from graphslam.estimation.window import IndeterminateWindowError, Window, WindowFactor
 
-#: steps after which states leave in `FixedLagBackend.restart`
-REPLAYED_AT_ONCE = 20
+#: steps of a solution after which states leave in a `Restart`, and by how many it comes nearer to
+#: the latest step with each part
+REPLAYED_AT_ONCE, CAUGHT_UP_AT_ONCE = 20, 2
 NO_CORRECTIONS: Mapping[int, Array] = MappingProxyType({})
 
 
@@ -51,15 +52,12 @@ class FixedLagBackend(GraphBackend):
     most_states: int | None = None
 
     def __init__(self, config: Config) -> None:
-        super().__init__(_builder())
+        # weights are of residuals at the current estimate, so the window applies the kernel
+        super().__init__(GraphBuilder(RobustConfig(kernel="none"), wide=False))
+        self._config = config
         self._horizon_ns = round(1e9 * config.backend.horizon_s)
-        self._kernel = config.robust
         self._kept: dict[tuple[str, int], int] = {}  # robot and time -> a state that stays
-        self._begin()
-
-    def _begin(self) -> None:
-        """Without any step."""
-        self._window = Window(self._kernel)
+        self._window = Window(config.robust)
         self._dormant = DormantVariables()
         self._points: dict[int, Array] = {}  # linearisation points of dormant landmarks
         self._z: dict[int, Array] | None = None  # their corrections, if computed since the step
@@ -108,7 +106,7 @@ class FixedLagBackend(GraphBackend):
             if group.new is not None:
                 window.insert(*group.new)
             window.factors += _window_factors(group)
-        self._optimise()
+        self.optimise()
         self._marginalise_before(step.time_ns - self._horizon_ns, self.covariance)
 
     def _seen_in(self, step: Step) -> set[int]:
@@ -119,7 +117,12 @@ class FixedLagBackend(GraphBackend):
         ends = {end for closure in step.closures for end in closure.pair}
         return seen | {self._kept[end] for end in ends & self._kept.keys()}
 
-    def _optimise(self) -> None:
+    def optimise(self) -> None:
+        """Solve the window.
+
+        Raises:
+            EstimationError: it is indeterminate.
+        """
         self._z = None
         try:
             self._window.optimise()
@@ -141,24 +144,33 @@ class FixedLagBackend(GraphBackend):
     def restart(self, steps: Sequence[Step], start: Estimate) -> None:
         """Forget all; go on after ``steps``, linearised where ``start`` has their variables.
 
-        Nothing is solved on the way, so it takes a third of the time of adding the steps. States
-        that left have no covariance. ``start`` should be the solution of the steps: past states
-        leave what they tell there.
-
-        Raises:
-            EstimationError: a covariance is not positive definite and finite, or the window is
-                indeterminate.
+        ``start`` should be the solution of the steps: past states leave what they tell there. See
+        `Restart`, which does it piece by piece.
         """
-        kept, self._kept = self._kept.keys(), {}
-        self.builder = _builder(lines=False)
-        self._joints.clear()
-        self._begin()
-        for first in range(0, len(steps), REPLAYED_AT_ONCE):
-            self._replay(steps[first : first + REPLAYED_AT_ONCE], start, kept)
-        self.builder.makes_lines = True
-        self._optimise()
+        begun = self.begin_restart(len(steps), start)
+        while not begun.advance(steps):
+            pass
+        self.finish_restart(begun)
 
-    def _replay(
+    def begin_restart(self, count: int, start: Estimate) -> "Restart":
+        """Begin to build the window again, where ``start`` has the variables of ``count`` steps."""
+        made = FixedLagBackend(self._config)
+        made.most_states = self.most_states
+        return Restart(made, start, count, self._kept.keys())
+
+    def finish_restart(self, begun: "Restart") -> None:
+        """Go on with what was built, once it has all steps."""
+        made = begun.backend
+        for state in self._kept.keys() - made._kept.keys():  # since its step was added
+            made.keep(*state)
+        for state in made._kept.keys() - self._kept.keys():
+            made.drop(*state)
+        self._joints.clear()
+        self.builder, self._window, self._dormant = made.builder, made._window, made._dormant
+        self._points, self._z, self._past = made._points, made._z, made._past
+        self._kept = made._kept
+
+    def replay(
         self, steps: Sequence[Step], start: Estimate, kept: Collection[tuple[str, int]]
     ) -> None:
         """Take in steps of the past, linearised where ``start`` has their variables."""
@@ -179,9 +191,7 @@ class FixedLagBackend(GraphBackend):
                     window.factors += _window_factors(made)
                 else:
                     window.factors += _window_factors(group)
-            for robot in step.motions:
-                if (robot, step.time_ns) in kept:
-                    self.keep(robot, step.time_ns)
+            self.keep_of(step, kept)
         of_lines = self.builder.line_factors_at_estimate(lines, self.value)
         window.factors += [
             WindowFactor(factor, tuple(factor.keys()), observed, robust=True)
@@ -289,6 +299,12 @@ class FixedLagBackend(GraphBackend):
         self._kept[robot, time_ns] = self._key(robot, time_ns)
         self.builder.kept = set(self._kept.values())
 
+    def keep_of(self, step: Step, kept: Collection[tuple[str, int]]) -> None:
+        """Keep the states of a step that are among ``kept``."""
+        for robot in step.motions:
+            if (robot, step.time_ns) in kept:
+                self.keep(robot, step.time_ns)
+
     def drop(self, robot: str, time_ns: int) -> bool:
         """Keep a state no longer; one that is dormant, and costs no step anything, stays so.
 
@@ -362,9 +378,52 @@ class FixedLagBackend(GraphBackend):
         return self.builder.estimate(self._past | self.marginals(left), self._window.half_error())
 
 
-def _builder(*, lines: bool = True) -> GraphBuilder:
-    """Factors without kernels: weights are by residuals at the estimate, applied by the window."""
-    return GraphBuilder(RobustConfig(kernel="none"), wide=False, lines=lines)
+class Restart:
+    """A smoother that is built at a solution of its steps, beside the one that is in use.
+
+    Nothing is solved until it has the steps of the solution, so it takes a third of the time of
+    adding them; the later ones are added as usual. States that left have no covariance.
+    """
+
+    def __init__(
+        self,
+        backend: FixedLagBackend,
+        start: Estimate,
+        count: int,
+        kept: Collection[tuple[str, int]],
+    ) -> None:
+        """Of a ``backend`` without steps; ``start`` solves the first ``count`` of them.
+
+        ``kept``: robots and times of the states that are to stay, see `FixedLagBackend.keep`.
+        """
+        self.backend = backend
+        self._start, self._count, self._kept = start, count, kept
+        self._done, self._known = 0, count  # steps that were taken in, and that there were
+        backend.builder.makes_lines = False
+
+    def advance(self, steps: Sequence[Step]) -> bool:
+        """Take in some more of all ``steps`` so far; whether it has them all.
+
+        Raises:
+            EstimationError: a covariance is not positive definite and finite, or the window is
+                indeterminate.
+        """
+        backend = self.backend
+        if self._done < self._count:
+            end = min(self._done + REPLAYED_AT_ONCE, self._count)
+            backend.replay(steps[self._done : end], self._start, self._kept)
+            if end == self._count:
+                backend.builder.makes_lines = True
+                backend.optimise()
+        else:
+            # so it gets there however many come with each part
+            new = len(steps) - self._known
+            end = min(self._done + new + CAUGHT_UP_AT_ONCE, len(steps))
+            for step in steps[self._done : end]:
+                backend.add(step)
+                backend.keep_of(step, self._kept)
+        self._done, self._known = end, len(steps)
+        return end == len(steps)
 
 
 def _window_factors(group: FactorGroup) -> list[WindowFactor]:

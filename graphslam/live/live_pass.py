@@ -15,7 +15,7 @@ import scipy.optimize  # noqa: F401 (association needs it: imported then, it del
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose, compose_cov, inverse, transform
 from graphslam.core.records import Estimate, Landmark, Message, Sighting, Start, Step
-from graphslam.estimation.fixed_lag import FixedLagBackend
+from graphslam.estimation.fixed_lag import FixedLagBackend, Restart
 from graphslam.live.loop_closing import LoopCloser
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
@@ -30,7 +30,7 @@ BUSY = 2
 #: s: odometry that is kept, at least
 SHORTEST_MEMORY_S = 10.0
 #: the beginning of a drive is solved as a batch until there are so many steps, or so long, ns: what
-#: follows is compared with its map, moved with its calibration. The last solution takes 0.3 s
+#: follows is compared with its map, moved with its calibration. The last solution takes 0.2 s
 LAST_BATCH_STEP, BEGINNING_NS = 600, 900_000_000_000
 
 
@@ -85,6 +85,7 @@ class LivePass(Pipeline):
         self.known_seen: set[int] = set()
         self.on_map = self.off_map = 0
         self._taken = 0  # of `steps`, by the events before
+        self._restart: Restart | None = None
         self._reported: dict[str, LiveEstimate] = {}
         self._closures = 0  # that are in `_closed_ns`, or were reported
         self._closed_ns: dict[str, int] = {}  # from when on a robot's next estimate has a closure
@@ -162,8 +163,29 @@ class LivePass(Pipeline):
         """See `StepRecorder`: in the beginning, while all that was seen is kept."""
         return self._known_map is None
 
+    def batch_step(self) -> bool:
+        """See `StepRecorder`; a part of it with each step, the last of which moves the estimate.
+
+        Parts are a number of steps, not what fits in a time: estimates are the same in every run.
+        """
+        if self._restart is None:
+            found = self.solve_steps()
+            self.batch_is_due = found is not None
+            if found is not None:
+                self._restart = self.backend.begin_restart(len(self.steps), found)
+            return False
+        if not self._restart.advance(self.steps):
+            return False
+        self.backend.finish_restart(self._restart)
+        self._restart, self.batch_is_due = None, False
+        for robot, run in self.started.items():
+            run.latest_pose = self.backend.state_mean(robot)
+        return True
+
     def _is_beginning(self) -> bool:
-        """Whether there will be a batch step, for which steps and odometry are to be kept."""
+        """Whether steps and odometry are to be kept, for a batch step that is going on or comes."""
+        if self.batch_is_due:
+            return True
         if self.next_batch_step > LAST_BATCH_STEP or self.last_ns > self.first_ns + BEGINNING_NS:
             self.next_batch_step = math.inf
         return math.isfinite(self.next_batch_step)

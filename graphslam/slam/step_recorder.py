@@ -8,7 +8,7 @@ from dataclasses import replace
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, rotation3
-from graphslam.core.records import Association, Motion, Step
+from graphslam.core.records import Association, Estimate, Motion, Step
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.batch_calibration import calibrate_so_far, recompute_motions
 from graphslam.estimation.compressed_filter import CompressedBackend
@@ -29,7 +29,8 @@ FIRST_BATCH_STEP, BATCH_STEP_GROWTH = 100, 1.25
 class StepRecorder(LogPass):
     """A pass that gives each step to a back end, and its observations to an associator.
 
-    ``next_batch_step``: the number of steps at which there is the next `batch_step`.
+    ``next_batch_step``: the number of steps at which there is the next `batch_step`;
+    ``batch_is_due``: whether it is to be done, or goes on.
     """
 
     batch_step_growth = BATCH_STEP_GROWTH
@@ -50,6 +51,7 @@ class StepRecorder(LogPass):
         starts = known.recorded.start_times()
         # scans have states of their own nearby, each checked against the one before
         self._closure_starts = {r: deque(t) for r, t in starts.items() if not log.has_scans(r)}
+        self.batch_is_due = False
         self.next_batch_step = FIRST_BATCH_STEP if wanted and self.restarts() else math.inf
 
     def restarts(self) -> bool:
@@ -134,13 +136,29 @@ class StepRecorder(LogPass):
                 self.learn(step, poses, known)
             if len(self.steps) >= self.next_batch_step:
                 self.next_batch_step = round(self.batch_step_growth * len(self.steps))
-                if self.batch_step():
-                    poses = {name: self.runs[name].latest_pose for name in poses}
+                self.batch_is_due = True
+            if self.batch_is_due and self.batch_step():
+                poses = {name: self.runs[name].latest_pose for name in poses}
             for name, pose in poses.items():
                 self.record_state(name, step.time_ns, pose)
 
     def batch_step(self) -> bool:
         """Solve all steps so far with the calibrations; the back end goes on from there.
+
+        Returns:
+            Whether that was done, see `solve_steps`.
+        """
+        self.batch_is_due = False
+        found = self.solve_steps()
+        if found is None or not isinstance(self.backend, CompressedBackend):
+            return False
+        self.backend.restart(self.steps, found)
+        for name in self.started:
+            self.runs[name].latest_pose = self.backend.state_mean(name)
+        return True
+
+    def solve_steps(self) -> Estimate | None:
+        """A solution of all steps so far with the calibrations, which go on from there.
 
         An incremental estimate lags behind its minimum: variables are linearised, and observations
         of lines slid along them, where they were believed to be. And what the calibration was taken
@@ -149,27 +167,24 @@ class StepRecorder(LogPass):
         Mapping, T-RO 24(6), 2008, DOI 10.1109/TRO.2008.2006706.
 
         Returns:
-            Whether that was done: not if there is nothing to calibrate, as without odometry, or if
-            the solution fails.
+            None if there is nothing to calibrate, as without odometry, if the back end is of
+            another kind, or if the solution fails.
         """
-        backend = self.backend
         tracks = {name: run.track for name, run in self.started.items()}
         held = all(track.prior.is_held for track in tracks.values())
-        if held or not isinstance(backend, CompressedBackend | FixedLagBackend):
-            return False
+        if held or not isinstance(self.backend, CompressedBackend | FixedLagBackend):
+            return None
         try:
             found = calibrate_so_far(
-                self.steps, backend.current_estimate(), tracks, self.config.robust
+                self.steps, self.backend.current_estimate(), tracks, self.config.robust
             )
         except EstimationError:  # the tree goes on with QR where this calls it indeterminate
-            return False
+            return None
         self.steps[:] = recompute_motions(self.steps, tracks)
-        backend.restart(self.steps, found)
         for name, track in tracks.items():
-            run = self.runs[name]
-            track.calibration = run.calibrator.restart(track.prior, track.calibration)
-            run.latest_pose = backend.state_mean(name)
-        return True
+            calibrator = self.runs[name].calibrator
+            track.calibration = calibrator.restart(track.prior, track.calibration)
+        return found
 
     def learn(self, step: Step, poses: Mapping[str, Array], known: set[int]) -> None:
         """Improve robots' calibration from a step.
