@@ -284,3 +284,38 @@ def off(found, wanted):
     """The largest difference of two means, m or rad."""
     pairs = zip([found.pose, *found.landmarks], [wanted.pose, *wanted.landmarks], strict=True)
     return max(np.abs(a - b).max() for a, b in pairs)
+
+
+def test_a_window_that_is_built_in_parts_is_the_one_that_is_built_at_once():
+    """Though steps come meanwhile, of which states are kept and are kept no longer."""
+    steps = rounds(3, 2 * LAP_S)
+    count = LAP_S + 20
+    whole, now, parts = smoother(1000), smoother(5), smoother(5)
+    for step in steps[:count]:
+        whole.add(step)
+        parts.add(step)
+    for second in (count - 4, count - 3):
+        parts.keep("a", second * S)
+    solved = whole.finish()
+    begun, end = parts.begin_restart(count, solved), count
+    while not begun.advance(steps[:end]):
+        parts.add(steps[end])
+        end += 1
+        if end == count + 3:
+            parts.drop("a", (count - 3) * S)
+            parts.keep("a", (count + 1) * S)
+    parts.finish_restart(begun)
+    # four parts have the past; each of the next brings it two steps nearer to the latest one
+    assert end == count + 5
+    now.restart(steps[:count], solved)
+    for k, step in enumerate(steps[count:end], start=count):
+        now.add(step)
+        if k == count + 1:
+            now.keep("a", k * S)
+    everything = sorted(solved.landmarks)
+    mine, other = parts.joint("a", everything), now.joint("a", everything)
+    assert off(mine, other) < 1e-6
+    np.testing.assert_allclose(mine.cov, other.cov, rtol=0, atol=1e-6 * other.cov.max())
+    kept = [("a", (count - 4) * S), ("a", (count + 1) * S)]
+    assert sorted(parts._kept) == kept
+    assert parts.poses(kept)[0].shape == (2, 3)
