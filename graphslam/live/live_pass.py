@@ -69,7 +69,7 @@ class LivePass(Pipeline):
     """A pass that reports each robot where it is, and forgets what is behind its horizon."""
 
     backend: FixedLagBackend
-    batch_step_growth = 1.5  # with 2.0 Intel is worse from 1200 s on, with 1.25 twice as many wait
+    batch_step_growth = 1.5  # with 2.0 Intel is worse from 1200 s on; 1.25 is no better
 
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
         """For the arguments see `LogPass`; the back end has a finite horizon."""
@@ -183,7 +183,10 @@ class LivePass(Pipeline):
         return True
 
     def _is_beginning(self) -> bool:
-        """Whether steps and odometry are to be kept, for a batch step that is going on or comes."""
+        """Whether steps and odometry are to be kept, for a batch step that is going on or comes.
+
+        Once it is over there is none any more, however many steps come at once.
+        """
         if self.batch_is_due:
             return True
         if self.next_batch_step > LAST_BATCH_STEP or self.last_ns > self.first_ns + BEGINNING_NS:
