@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.errors import EstimationError
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, transform, wrap
-
-IntArray = NDArray[np.int64]
 
 #: probability up to which a point or a relative pose still fits what it is compared with
 FIT_PROBABILITY = 0.9999

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, compose, polar_points, rotate_cov
 from graphslam.core.observation_models import MODELS, transport
 from graphslam.core.record import Record
 from graphslam.core.records import Observation
-
-IntArray = NDArray[np.int64]
 
 #: kinds of landmarks and the models that compare them, by their codes in arrays
 KINDS = ("point", "line", "segment")

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, path_length
 from graphslam.core.information_root import InformationRoot
@@ -25,7 +26,6 @@ from graphslam.core.record import Record
 
 #: a time or times (...,), ns
 Stamps = int | Sequence[int] | np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,15 +3,14 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate, Step, Trajectory
-
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 #: why a back end could not use something, the keys of `Backend.skipped`
 LATE_EVIDENCE = "late evidence"

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, between
 from graphslam.core.record import replace
@@ -25,7 +26,6 @@ from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.odometry.calibration_jacobian import at_estimated_motion
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
 
 #: times that everything is solved: after the first the calibration moves by a tenth of its sigma
 ROUNDS = 2

@@ -8,11 +8,11 @@ is estimated jointly, and its uncertainty is in every covariance.
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import gtsam
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
 from graphslam.core.motion_models import HELD_SIGMA, MOUNT_NAMES, Calibration
@@ -36,8 +36,6 @@ from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph,
 from graphslam.estimation.sandwich_covariance import CovarianceFactors, covariance_factors
 from graphslam.estimation.surface_bias import with_surface_bias
 from graphslam.estimation.weighed_walls import WeighedWalls
-
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 #: relative decrease of the error at which optimisation ends
 CONVERGED_ERROR = 1e-5

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.blas import dtrsm
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
 from graphslam.estimation import factors
 from graphslam.estimation.square_root import (
-    IntArray,
     Rows,
     column_slices,
     columns_of,

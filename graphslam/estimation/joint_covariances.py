@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
-from graphslam.core.information_root import InformationRoot, IntArray
+from graphslam.core.information_root import InformationRoot
 from graphslam.core.mount_covariances import MountCovariances
 
 if TYPE_CHECKING:  # what reads the root of a folder needs no GTSAM

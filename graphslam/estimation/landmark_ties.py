@@ -10,17 +10,14 @@ later messages, sightings of robots, and ties of others make the comparison shar
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import AssociationConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, rotation3, wrap
 from graphslam.core.observation_models import MODELS
-
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 #: rows of the difference of two landmarks: of points along both axes, of walls offset and direction
 ROWS = 2

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, path_length, rotate_cov, rotation3
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.observation_models import LineModel
@@ -13,7 +14,7 @@ from graphslam.estimation import factors
 from graphslam.estimation.isam2 import observed_ends
 from graphslam.estimation.joint_covariances import covariance_of
 from graphslam.estimation.posterior_residuals import Residuals
-from graphslam.estimation.recorded_graph import IntArray, RecordedGraph
+from graphslam.estimation.recorded_graph import RecordedGraph
 from graphslam.estimation.weighed_walls import WeighedWalls, weighed_walls
 
 

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3
 from graphslam.core.motion_models import Increments
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Step
 from graphslam.estimation import factors
-from graphslam.estimation.recorded_graph import IntArray, RecordedGraph, Source
+from graphslam.estimation.recorded_graph import RecordedGraph, Source
 from graphslam.estimation.selected_inverse import CovarianceBlocks
 from graphslam.odometry.noise_estimation import clipped
 

@@ -8,11 +8,11 @@ of thousands.
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import gtsam
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, are_positive
 from graphslam.core.observation_models import MODELS
@@ -23,7 +23,6 @@ from graphslam.estimation.input_checks import describe, describe_motion
 from graphslam.estimation.isam2 import BatchGraph, observed_ends
 from graphslam.estimation.weighed_walls import WeighedWalls, weighed_walls
 
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
 #: who made an observation of bearing and range, and its row of `MODELS`
 Source = tuple[str, str]
 

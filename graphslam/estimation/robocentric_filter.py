@@ -8,16 +8,11 @@ frame is not. Source: J. Castellanos, R. Martinez-Cantin, J. Tardós, J. Neira, 
 joining, Robotics and Autonomous Systems 55(1), 2007, https://doi.org/10.1016/j.robot.2006.06.005.
 """
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.gaussian import symmetric, whiten
 from graphslam.core.geometry import Array, between, inverse, rotation3, wrap
-
-IntArray = NDArray[np.integer[Any]]
-BoolArray = NDArray[np.bool_]
 
 #: the first two members: the previous pose, and the anchor
 PREVIOUS, ANCHOR = 0, 1

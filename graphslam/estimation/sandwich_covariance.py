@@ -17,13 +17,13 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags, vstack
 from scipy.sparse.linalg import SuperLU, splu
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate
 from graphslam.estimation import factors
 from graphslam.estimation.recorded_graph import (
     SHARED_NS,
-    IntArray,
     ObservationNoise,
     RecordedGraph,
     Source,

@@ -12,9 +12,9 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtpmqrt, dtpqrt
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
 
-IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 #: the order that eliminates the first of two stacked variables
 _FIRST = gtsam.Ordering([0])
 #: columns that LAPACK eliminates at a time

@@ -13,8 +13,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, inverse, rotation3
-from graphslam.core.information_root import InformationRoot, IntArray
+from graphslam.core.information_root import InformationRoot
 from graphslam.core.observation_models import MODELS, LineModel
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate

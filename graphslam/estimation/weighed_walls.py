@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, rotate_cov
 from graphslam.core.information_root import InformationRoot
@@ -13,8 +13,6 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association
 from graphslam.estimation import factors
 from graphslam.estimation.m_estimators import WEIGHTS
-
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,12 +16,13 @@ import numpy as np
 from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.records import Association
 from graphslam.estimation import factors
 from graphslam.estimation.m_estimators import WEIGHTS
-from graphslam.estimation.square_root import IntArray, Rows, column_slices, columns_of, stacked
+from graphslam.estimation.square_root import Rows, column_slices, columns_of, stacked
 
 #: largest number of Gauss-Newton iterations per step, and the norm of the update (m, rad) that ends
 #: them. A step starts where the last one ended, so two are the rule.
@@ -32,7 +33,6 @@ RELINEARISE = 1e-3
 #: Cholesky is used while no variable's variance exceeds by more what it is given all others: it
 #: loses as many digits, and QR half of them
 WORST_RATIO = 1e10
-BoolArray = np.ndarray[tuple[int], np.dtype[np.bool_]]
 IndexArray = np.ndarray[tuple[int, int], np.dtype[np.int64]]
 #: columns of a factor's rows: two variables of three, and the right side
 _WIDTH = 7

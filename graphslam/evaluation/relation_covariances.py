@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, adjoint, between, inverse
-from graphslam.core.records import IntArray, JointScans, Trajectory
+from graphslam.core.records import JointScans, Trajectory
 from graphslam.estimation.joint_covariances import pair_covariances
 
 #: pairs whose covariances are computed at a time, from the first scan on: bounds the memory

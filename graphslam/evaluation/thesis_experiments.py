@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from graphslam.change_detection import detect_changes, load_visit
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, transform
@@ -34,7 +35,6 @@ def with_known_starts(config: Config) -> Config:
 
 
 Array = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 #: where a robot's poses are taken from
 WITH, WITHOUT, TRUE = "with landmarks", "dead reckoning", "true poses"

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.records import Message, OdometryIncrement, RelativePose
-
-IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 
 @dataclass(frozen=True, slots=True)

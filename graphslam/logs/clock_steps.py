@@ -7,15 +7,14 @@ placed among the others. They are left out and counted.
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.topics import Topic
 
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
 _NO_END = np.iinfo(np.int64).max
 #: topic -> first and last time, ns, that its messages in a recording may have
 Spans = Mapping[str, tuple[int, int]]

@@ -7,6 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config, RobotConfig
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import Array, exp, rotation3
@@ -15,7 +16,7 @@ from graphslam.core.record import replace
 from graphslam.core.records import OdometryPose, WheelAngles
 from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.findings import Finding
-from graphslam.logs.imu import IntArray, imu_topics, turn_rates
+from graphslam.logs.imu import imu_topics, turn_rates
 from graphslam.logs.imu_turning import Turning, find_turning
 from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.tf_tree import sampled_edges, static_tree

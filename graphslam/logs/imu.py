@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
 from graphslam.logs import schemas
 from graphslam.logs.cdr import HEADER, CdrError, Layout, byte_order, u32
 from graphslam.logs.mounts import TransformTree, axis_above
 from graphslam.logs.recording import Recording, raw_messages
 from graphslam.logs.tf_tree import namespace_of
-
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 #: messages that are decoded together
 _BATCH = 1024

@@ -18,13 +18,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobotConfig
 from graphslam.core.geometry import Array, between, compose, exp, log, wrap
 from graphslam.core.motion_models import rows_of_twists, wheel_twist
 from graphslam.core.record import replace
 from graphslam.core.records import Message, OdometryPose, WheelAngles
-
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 #: ns: the gyroscope knows nothing of a longer time between two of its readings
 GAP_NS = 200_000_000

@@ -14,7 +14,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Schema
 
-IntArray = np.ndarray[Any, np.dtype[np.int64]]
+from graphslam.core.arrays import IntArray
+
 UnsignedArray = np.ndarray[Any, np.dtype[np.unsignedinteger[Any]]]
 
 # Errors that mcap, zstandard and lz4 raise on damaged bytes, found by flipping and cutting: their

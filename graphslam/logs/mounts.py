@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from graphslam.core import records
+from graphslam.core.arrays import BoolArray
 from graphslam.core.geometry import Array
 from graphslam.core.record import replace
 
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 # Child -> (parent, parent_from_child (4, 4)): a frame has one parent.
 TransformTree = Mapping[str, tuple[str, Array]]
 

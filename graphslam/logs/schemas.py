@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array
 from graphslam.logs.cdr import (
@@ -26,8 +27,6 @@ from graphslam.logs.cdr import (
     string,
     u32,
 )
-
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 DEFAULT_ROBOT = "robot"  # its topics have no namespace
 

@@ -9,10 +9,10 @@ wall on both sides, or on one.
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.geometry import Array
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Step
-from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.wall_observations import (
     PATH_M,

@@ -14,12 +14,12 @@ from functools import cached_property
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray
 from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array, compose, rotate_cov
 from graphslam.core.records import Association, Motion, Observation
 from graphslam.estimation.backend import Backend, JointMarginal
 from graphslam.mapping.gating import (
-    BoolArray,
     PairDistances,
     Pairs,
     candidate_pairs,

@@ -14,13 +14,13 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.consistency import RIVAL_D2
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, whiten
 from graphslam.core.geometry import Array, between, rotate_cov, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Step
 from graphslam.estimation.backend import JointMarginal
-from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.landmark_map import Entry, LandmarkMap, retarget
 
 #: m, rad, m: how much two estimates of one wall may differ beyond their covariance: across it, in

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import AssociationConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, between, compose, rotate_cov, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Observation
-
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 #: rad: lines that differ more in direction are never compared, however uncertain the heading
 MAX_ANGLE_RAD = 0.6

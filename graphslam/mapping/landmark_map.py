@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between, compose, rotate_cov
 from graphslam.core.observation_models import MODELS
@@ -24,7 +25,6 @@ from graphslam.core.records import (
 )
 from graphslam.core.sensor_config import LimitsConfig
 from graphslam.estimation.backend import Backend
-from graphslam.mapping.gating import BoolArray, IntArray
 
 #: m: landmarks of an earlier map that are nearer to each other are known to be different things
 KNOWN_NEAR_M = 2.0

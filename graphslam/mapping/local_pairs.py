@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import AssociationConfig
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, log_jacobian, wrap
 from graphslam.core.observation_arrays import LINE, POINT, SEGMENT, ObservationArrays
 from graphslam.core.observation_models import MODELS
-from graphslam.mapping.gating import LENGTH_TOLERANCE_M, MAX_ANGLE_RAD, BoolArray, IntArray
+from graphslam.mapping.gating import LENGTH_TOLERANCE_M, MAX_ANGLE_RAD
 
 
 @dataclass(slots=True, eq=False)

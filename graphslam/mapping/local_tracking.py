@@ -13,13 +13,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array, between, compose
 from graphslam.core.observation_arrays import KINDS, LINE, POINT, ROWS, SEGMENT, ObservationArrays
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Motion
 from graphslam.estimation.robocentric_filter import ANCHOR, PREVIOUS, RobocentricFilter
-from graphslam.mapping.gating import BoolArray, IntArray, assign, gate_distance
+from graphslam.mapping.gating import assign, gate_distance
 from graphslam.mapping.landmark_map import Entry
 from graphslam.mapping.local_pairs import LocalLandmarks, LocalPairs, candidate_pairs
 

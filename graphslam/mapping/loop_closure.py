@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.companion import Companion
 from graphslam.core.config import LoopClosureConfig
 from graphslam.core.consistency import largest_consistent_set
@@ -27,7 +28,6 @@ from graphslam.mapping.corridor_direction import (
 from graphslam.mapping.submap_graph import relative_jacobian
 from graphslam.mapping.submaps import State, SubmapPose, drift_covariance
 from graphslam.perception.scan_matching import (
-    IntArray,
     Match,
     Submap,
     agreement,

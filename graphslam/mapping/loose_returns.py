@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotation3, transform_each, unit_vectors, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, KeyframeScan, Step
-from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.landmark_map import Entry, observed_from
 from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
 from graphslam.mapping.submaps import State

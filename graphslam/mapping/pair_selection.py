@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray
 from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array
-from graphslam.mapping.gating import BoolArray, PairDistances, Pairs, assign
+from graphslam.mapping.gating import PairDistances, Pairs, assign
 from graphslam.mapping.landmark_map import Entry
 
 #: landmarks per observation whose joint marginal is read, the nearest by crude distance: recently

@@ -13,11 +13,12 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, Step
-from graphslam.mapping.gating import IntArray, assign
+from graphslam.mapping.gating import assign
 from graphslam.mapping.landmark_map import observed_from
 
 #: points nearest to where a sighting lies that it is compared with

@@ -14,10 +14,10 @@ from operator import is_
 import numpy as np
 from scipy.spatial import cKDTree
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, compose, path_length, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step
-from graphslam.mapping.gating import IntArray
 from graphslam.mapping.landmark_map import Entry, observed_from, retarget
 from graphslam.mapping.wall_samples import sample_walls
 

@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, compose, transform, unit_vectors
-from graphslam.core.records import IntArray, KeyframeScan, Landmark, Trajectory
+from graphslam.core.records import KeyframeScan, Landmark, Trajectory
 
 #: m: a beam has passed a landmark if it ends so far behind it; parts of walls that are judged one
 #: by one; ends of walls that are left out

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array
-from graphslam.mapping.gating import IntArray
 from graphslam.mapping.wall_samples import sample_walls
 from graphslam.perception.line_fit import SMALLEST_SIGMA_M
 

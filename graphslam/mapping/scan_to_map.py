@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform_each, wrap
-from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
 
 #: sigmas that a return may be off the wall that it is taken for, and from which on it pulls with

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import LoopClosureConfig
 from graphslam.core.geometry import Array, between
 from graphslam.core.records import Closure
-from graphslam.mapping.gating import IntArray
 from graphslam.mapping.loop_closure import (
     ALREADY_CLOSED,
     COV_INFLATION,

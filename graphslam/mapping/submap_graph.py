@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.errors import EstimationError
 from graphslam.core.gaussian import symmetric
 from graphslam.core.geometry import (
@@ -25,7 +26,6 @@ from graphslam.core.geometry import (
     rotate_cov,
     rotation3,
 )
-from graphslam.mapping.gating import BoolArray, IntArray
 
 #: Gauss-Newton steps at most; m or rad: it has converged when nothing moves more than this
 MAX_STEPS, CONVERGED = 10, 1e-5

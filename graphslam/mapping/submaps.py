@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.geometry import (
     Array,
@@ -17,7 +18,7 @@ from graphslam.core.geometry import (
     wrap,
 )
 from graphslam.core.records import KeyframeScan, Trajectory
-from graphslam.perception.scan_matching import IntArray, Submap, make_submap
+from graphslam.perception.scan_matching import Submap, make_submap
 
 #: m of path and rad turned between the scans of a submap: nearer ones show the same
 SCAN_M, SCAN_RAD = 0.5, 0.4

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import AssociationConfig
 from graphslam.core.geometry import Array, between, path_length
 from graphslam.core.records import Estimate, Step, Trajectory
@@ -18,7 +19,6 @@ from graphslam.mapping.duplicate_landmarks import (
     merged_steps,
     near_pairs,
 )
-from graphslam.mapping.gating import IntArray
 from graphslam.mapping.landmark_map import Entry, LandmarkMap
 
 #: m across, rad: walls of two visits that differ less, in a solution with closed loops, are one

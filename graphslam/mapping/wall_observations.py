@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.geometry import Array, between, compose, rotation3
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step
-from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.mapping.landmark_map import LandmarkMap, observed_from, retarget
 
 #: m, rad: error of a visit's path where it sees a wall

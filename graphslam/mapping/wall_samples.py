@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, unit_vectors
-from graphslam.mapping.gating import IntArray
 
 
 def sample_walls(means: Array, extents: Array, spacing_m: float) -> tuple[Array, IntArray]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.consistency import fit_rigid_transform
 from graphslam.core.geometry import (
     Array,
@@ -29,7 +30,6 @@ from graphslam.core.geometry import (
 from graphslam.core.records import Scan
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.multi_robot.robot_detection import MARGIN_M, MAX_POSITION_SIGMA_M
-from graphslam.odometry.readings import IntArray
 from graphslam.perception.dynamic_objects import MIN_SHARE as STANDING_SHARE
 from graphslam.perception.dynamic_objects import returns_present_before
 from graphslam.perception.ordered_scan import Sweep, make_sweep

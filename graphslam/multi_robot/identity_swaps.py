@@ -14,11 +14,11 @@ from itertools import combinations
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, compose
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Sighting
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
 
 #: sightings of an identity that are needed to judge it
 MIN_SIGHTINGS = 20

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.consistency import fit_rigid_transform, has_rival
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, between, transform, wrap
 from graphslam.multi_robot.relative_frames import MAX_HEADING_SIGMA_RAD, RelativeFrame
-from graphslam.perception.scan_matching import IntArray
 
 #: means (n, 2) m and covariances (n, 2, 2) of points
 Points = tuple[Array, Array]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray
 from graphslam.core.config import MultiRobotConfig
 from graphslam.core.consistency import greedy_max_clique
 from graphslam.core.geometry import Array, between, compose, inverse, transform
@@ -28,7 +29,6 @@ from graphslam.multi_robot.place_recognition import (
 )
 from graphslam.multi_robot.place_search import alternative_alignments
 from graphslam.perception.scan_matching import (
-    BoolArray,
     Submap,
     align_pairs,
     compare_with_scans,

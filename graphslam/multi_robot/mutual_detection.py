@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.consistency import RIVAL_SHARE, has_rival, poses_differ
 from graphslam.core.geometry import Array, between, compose, path_length, wrap
@@ -50,7 +51,6 @@ from graphslam.multi_robot.robot_detection import (
 )
 from graphslam.multi_robot.track_registration import FittedStart, fit_start
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
 from graphslam.perception.ordered_scan import Sweep
 from graphslam.perception.robot_outlines import MIN_RETURNS, expected_ranges, outline_radius
 

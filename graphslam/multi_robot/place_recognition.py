@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import MultiRobotConfig
 from graphslam.core.consistency import (
     generalised_least_squares,
@@ -41,7 +42,7 @@ from graphslam.multi_robot.place_search import (
     search_poses,
 )
 from graphslam.multi_robot.relative_frames import RelativeFrame, evenly_spaced
-from graphslam.perception.scan_matching import IntArray, Match, match, match_pairs
+from graphslam.perception.scan_matching import Match, match, match_pairs
 
 #: submaps of a robot that are searched for at most
 MAX_SUBMAPS = 80

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.consistency import (
     FIT_PROBABILITY,
@@ -39,7 +40,6 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Sighting, Trajectory
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
 
 #: probability of the chi-square test by which two distances agree
 AGREE = 0.99

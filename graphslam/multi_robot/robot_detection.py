@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray
 from graphslam.core.config import Config, FrontEndConfig
 from graphslam.core.consistency import RIVAL_D2
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, move_block
@@ -65,7 +66,6 @@ KEPT_SCANS, KEPT_INTERVAL_NS = 8, 1_000_000_000
 
 #: an earlier scan, and the present pose (3,) of the laser in the frame of the laser then
 View = tuple[Sweep, Array]
-Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,7 +231,7 @@ def _sighting(scan: Scan, name: str, fit: OutlineFit) -> Sighting:
     return Sighting(scan.robot, scan.stamp_ns, scan.time_ns, z, cov, None, name, scan.mount)
 
 
-def without_returns(scan: Scan, sweep: Sweep, gone: Flags) -> Scan:
+def without_returns(scan: Scan, sweep: Sweep, gone: BoolArray) -> Scan:
     """The scan without returns of rows ``gone`` (k,) of its sweep."""
     # a sweep has the beams in another order; those of a deskewed scan are not equally spaced
     angles, order = sweep.angles[sweep.beam[gone]], np.argsort(scan.angles)

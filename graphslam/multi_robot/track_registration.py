@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.consistency import (
     FIT_PROBABILITY,
     LeastSquaresFit,
@@ -22,7 +23,6 @@ from graphslam.core.geometry import Array, compose, rotation, rotation3, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Sighting
 from graphslam.multi_robot.relative_frames import RobotEstimate, encounter_covariance
-from graphslam.odometry.readings import IntArray
 
 #: Gauss-Newton steps; s: span over which a robot's velocity is taken
 STEPS, VELOCITY_SPAN_S = 6, 0.3

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between
 from graphslam.core.motion_models import Increments
 from graphslam.core.record import replace
 from graphslam.odometry.increment_sums import IncrementSums, Motions
-from graphslam.odometry.readings import IntArray
 
 if TYPE_CHECKING:
     from graphslam.odometry.preintegration import Track

@@ -7,10 +7,10 @@ are added up, and an increment by itself stays as it was recorded.
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, compose, rotation3
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
 
 
 def consecutive_motions(track: Track, times_ns: IntArray) -> Motions:

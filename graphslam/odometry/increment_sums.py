@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, rotation3
 from graphslam.core.motion_models import Increments
 from graphslam.core.records import Motion
-from graphslam.odometry.readings import IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,8 +9,9 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.odometry.increment_sums import Motions
-from graphslam.odometry.readings import IntArray, Readings, integrate_pending
+from graphslam.odometry.readings import Readings, integrate_pending
 
 _Track = TypeVar("_Track", bound=Readings)
 #: a track with the times (n,) and (n,) between which motions are

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import (
     Array,
@@ -27,8 +28,6 @@ from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, ScanTies, Start, Step, Trajectory
 from graphslam.odometry.preintegration import Track
-
-IntArray = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 #: squared distance, three degrees of freedom, and m, rad, beyond which a motion that odometry did
 #: not see is no noise. Where it is less, Intel's scans between states are better placed by noise

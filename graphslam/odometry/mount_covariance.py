@@ -11,11 +11,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, compose_jacobians, inverse
 from graphslam.core.mount_covariances import MountCovariance, MountCovariances
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Trajectory
-from graphslam.odometry.interpolation import IntArray, trajectory_of_mount
+from graphslam.odometry.interpolation import trajectory_of_mount
 
 
 def with_mount_errors(

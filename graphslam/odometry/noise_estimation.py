@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import OdometryConfig
 from graphslam.core.geometry import Array
 from graphslam.core.motion_models import RATES
 from graphslam.odometry.increment_sums import transformed
 from graphslam.odometry.mounted_motions import lever_to
 from graphslam.odometry.preintegration import Track, path_sums
-from graphslam.odometry.readings import IntArray
 
 #: sigma of the logarithm of an unknown variance, before any data: a factor of ten
 PRIOR_LOG_SIGMA = math.log(10.0)

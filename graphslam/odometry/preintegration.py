@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import (
     Array,
@@ -37,7 +38,7 @@ from graphslam.odometry.coarse_motions import coarse_motions
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
 from graphslam.odometry.integration_windows import in_windows
 from graphslam.odometry.mounted_motions import of_mount
-from graphslam.odometry.readings import BoolArray, IntArray, Readings
+from graphslam.odometry.readings import Readings
 
 #: m and rad: sigma of the motion of a robot that reports none
 STANDING_SIGMA = 1e-4

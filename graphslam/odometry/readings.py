@@ -12,14 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import Array, between, compose, exp, log, wrap
 from graphslam.core.motion_models import wheel_twist
 from graphslam.core.records import OdometryIncrement, OdometryPose, WheelAngles
 from graphslam.odometry.missing_increments import SAME_NS, MissingIncrements, bridge
 
-IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 Odometry = OdometryPose | OdometryIncrement | WheelAngles
 
 #: the odometry was reset if it moves faster than this share of ``odometry.max_speed_m_s`` for this

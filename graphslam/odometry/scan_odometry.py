@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, symmetric, update
 from graphslam.core.geometry import Array, rotation, wrap
@@ -29,9 +29,7 @@ from graphslam.perception.scan_matching import (
     match_pairs,
     shares_on_others,
 )
-from graphslam.perception.scan_pairs import IntArray, fit_pairs
-
-BoolArray = NDArray[np.bool_]
+from graphslam.perception.scan_pairs import fit_pairs
 
 #: scans with fewer points are not matched
 MIN_POINTS = 30

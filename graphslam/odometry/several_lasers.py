@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import (
     Array,
@@ -28,7 +29,6 @@ from graphslam.core.record import replace
 from graphslam.core.records import Motion, Trajectory
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, path_sums
-from graphslam.odometry.readings import IntArray
 
 
 class SeveralLasersTrack(Track):

@@ -12,17 +12,14 @@ DOI 10.1109/LRA.2021.3062815, where the lines are eliminated in the same way.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import cKDTree
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, transform_each, wrap
 from graphslam.perception.point_to_line import offset_jacobian, step_poses
-
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
 #: rounds in which surfaces are found and poses solved
 ROUNDS = 3

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, between, rotation3, transform
 from graphslam.perception.correlation import occupancy_grid
@@ -27,9 +27,6 @@ from graphslam.perception.point_to_line import (
     point_terms,
     step_poses,
 )
-
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
 
 #: neighbours that give the direction of a surface: most, fewest, and their distance at most, cells
 NEIGHBOURS, FEWEST_NEIGHBOURS, NEIGHBOURHOOD_CELLS = 8, 4, 6

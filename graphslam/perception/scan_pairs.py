@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.geometry import Array, transform_each
 from graphslam.perception.point_to_line import normal_equations, point_terms
@@ -24,8 +24,6 @@ from graphslam.perception.scan_matching import (
     UNKNOWN_VAR,
     information_from_scatter,
 )
-
-IntArray = NDArray[np.intp]
 
 #: m between two scans in the tree: far beyond the range of any laser
 APART_M = 1e4

@@ -12,9 +12,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
-from graphslam.core.information_root import InformationRoot, IntArray
+from graphslam.core.information_root import InformationRoot
 from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, JointScans, RobotResult, ScanTies, Trajectory

@@ -2,12 +2,11 @@
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray
 from graphslam.core.geometry import Array, rotation
 from graphslam.simulation.raycast import points_in_frames
 from graphslam.simulation.scenario import Body
 from graphslam.simulation.world import Shapes
-
-Flags = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 
 def corners(body: Body) -> Array:
@@ -27,7 +26,7 @@ def outline_shapes(body: Body, poses: Array) -> Shapes:
     return Shapes(np.stack([points, np.roll(points, -1, axis=1)], axis=2), np.zeros((n, 0, 3)))
 
 
-def contacts(body: Body, poses: Array, shapes: Shapes) -> Flags:
+def contacts(body: Body, poses: Array, shapes: Shapes) -> BoolArray:
     """Whether the body at poses (n, 3) overlaps each surface: (n, surfaces).
 
     A body inside a circle overlaps it; for a body inside a polygon see `encloses`.
@@ -47,7 +46,7 @@ def contacts(body: Body, poses: Array, shapes: Shapes) -> Flags:
     return np.concatenate([straight, round_], axis=1)
 
 
-def encloses(polygon: Array, points: Array) -> Flags:
+def encloses(polygon: Array, points: Array) -> BoolArray:
     """Which of ``points`` (n, 2) lie inside a simple polygon (k, 2), by crossings of a ray."""
     a, b = polygon, np.roll(polygon, -1, axis=0)
     x, y = points[:, None, 0], points[:, None, 1]
@@ -66,7 +65,7 @@ def _distance(a: Array, b: Array) -> Array:
     return np.asarray(np.hypot(foot[..., 0], foot[..., 1]))
 
 
-def _crosses_rectangle(a: Array, b: Array, low: Array, high: Array) -> Flags:
+def _crosses_rectangle(a: Array, b: Array, low: Array, high: Array) -> BoolArray:
     """Which segments a-b (n, k, 2) intersect the rectangle ``low``-``high`` (2,), by clipping."""
     e = b - a
     flat = np.abs(e) < 1e-15

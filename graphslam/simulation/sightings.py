@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.simulation.raycast import BeamFan, cast_beams
-from graphslam.simulation.robot_shapes import Flags, outline_shapes
+from graphslam.simulation.robot_shapes import outline_shapes
 from graphslam.simulation.scenario import Body, SightingSensor
 from graphslam.simulation.world import Shapes, World
 
@@ -112,7 +113,7 @@ def with_faults(
             yield SimulatedSighting(seen.sample, "", z, seen.cov, str(rng.choice(list(names))))
 
 
-def _line_of_sight(poses: Array, bearing: Array, distance: Array, target: Target) -> Flags:
+def _line_of_sight(poses: Array, bearing: Array, distance: Array, target: Target) -> BoolArray:
     """Whether the line of sight to the target's surface is free, per sample (n,)."""
     towards = poses + np.column_stack([np.zeros((len(poses), 2)), bearing])
     free = np.full(len(poses), np.inf)

@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.records import Estimate, Sighting, Step
 from graphslam.estimation.recorded_graph import SHARED_NS, Source
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
 from graphslam.slam.log_noise import LogNoise
 from graphslam.slam.reoptimise_sightings import SightingGroup
 from graphslam.slam.sighting_noise import estimate_noise

@@ -1,11 +1,8 @@
 """A reason to doubt a result, and what the checks that give reasons share."""
 
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-
-from graphslam.odometry.interpolation import IntArray
+from graphslam.core.arrays import IntArray
 
 #: m, rad: a robot that its other sensors saw move by more did move, whatever odometry says
 MOVED_M, MOVED_RAD = 0.3, 0.25
@@ -27,9 +24,3 @@ class Reason:
 def seconds(times_ns: IntArray | int, origin_ns: int) -> str:
     """A time, ns, as people read it: seconds since the log began at ``origin_ns``."""
     return f"{(float(times_ns) - origin_ns) * 1e-9:.1f} s"
-
-
-def stretches(flags: np.ndarray[Any, np.dtype[np.bool_]]) -> list[tuple[int, int]]:
-    """Where flags (n,) are true without a break: first place, and the one after the last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

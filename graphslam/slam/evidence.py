@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, RobotResult, Step
-from graphslam.odometry.interpolation import IntArray
 from graphslam.odometry.missing_increments import MissingIncrements
 from graphslam.slam.curved_walls import curved_share
 from graphslam.slam.log_pass import LogPass
@@ -25,7 +25,6 @@ from graphslam.slam.scan_evidence import Parked, gather_scan_evidence
 from graphslam.slam.sweep_skew import NO_SKEW, SweepSkew, by_robot, sweep_skew
 from graphslam.slam.told_starts import ToldStart, told_starts
 
-BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 IntTable = np.ndarray[tuple[int, int], np.dtype[np.int64]]
 
 #: poses of a trajectory that are compared, at most

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.motion_models import Increments
 from graphslam.core.record import replace
@@ -26,7 +27,6 @@ from graphslam.odometry.noise_estimation import (
     with_fit_uncertainty,
 )
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
 from graphslam.slam.log_noise import MOTION, LogNoise
 
 #: motions of a robot from which their noise is estimated at least

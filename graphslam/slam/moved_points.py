@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, polar_points, transform_each
-from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.doubts import MOVED_M, Reason, seconds
 from graphslam.slam.evidence import Evidence, Seen
 

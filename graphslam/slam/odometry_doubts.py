@@ -9,8 +9,9 @@ from itertools import chain
 
 import numpy as np
 
+from graphslam.core.arrays import stretches
 from graphslam.core.geometry import Array, between, wrap
-from graphslam.slam.doubts import MOVED_M, MOVED_RAD, Reason, seconds, stretches
+from graphslam.slam.doubts import MOVED_M, MOVED_RAD, Reason, seconds
 from graphslam.slam.evidence import Evidence, RobotEvidence
 from graphslam.slam.path_evidence import FACTORS as PATH_FACTORS
 from graphslam.slam.path_evidence import better_fit

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, exp, log, path_length, rotate_cov
 from graphslam.core.records import Closure, Step, Trajectory
-from graphslam.mapping.gating import IntArray
 from graphslam.mapping.known_map import MAP_ROBOT, KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.redundant_closures import Span

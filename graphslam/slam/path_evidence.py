@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose
 from graphslam.core.records import KeyframeScan, Scan, Trajectory
-from graphslam.odometry.interpolation import IntArray
 from graphslam.perception.along_walls import NearReturns, misfits, near_returns, open_direction
 from graphslam.perception.ordered_scan import scan_points
 

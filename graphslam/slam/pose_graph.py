@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.records import (
@@ -30,7 +31,6 @@ from graphslam.estimation.replay import replay
 from graphslam.logs import LogSet
 from graphslam.odometry.given_increments import consecutive_motions
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray
 from graphslam.slam.initialisation import estimate_start_poses
 from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
 from graphslam.slam.log_reader import TRUE_RECORDS

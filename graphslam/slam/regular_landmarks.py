@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, polar_points, rotation3
-from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.doubts import Reason
 from graphslam.slam.evidence import Evidence, RobotEvidence, Seen
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
@@ -20,7 +21,6 @@ from graphslam.estimation.batch_calibration import ROUNDS, calibrate
 from graphslam.estimation.sandwich_covariance import shared_spans, weighing_variance
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.preintegration import Track, preintegrate_batch
-from graphslam.odometry.readings import IntArray
 from graphslam.slam.log_noise import LogNoise
 from graphslam.slam.motion_noise import noise_scales, scale_motion_noise
 from graphslam.slam.sighting_batches import transport_batch, transport_target

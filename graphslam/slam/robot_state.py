@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.mount_covariances import MountCovariance
@@ -13,7 +14,6 @@ from graphslam.core.records import Motion, RobotResult, Scan, Trajectory
 from graphslam.logs.clock import Clock
 from graphslam.odometry.interpolation import (
     BetterScans,
-    IntArray,
     causal_at,
     final_at,
     final_scans,

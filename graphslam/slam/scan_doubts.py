@@ -4,9 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray
 from graphslam.core.geometry import Array, between
 from graphslam.slam.doubts import MOVED_M, MOVED_RAD, Reason, seconds
-from graphslam.slam.evidence import BoolArray, Evidence, IntTable, RobotEvidence
+from graphslam.slam.evidence import Evidence, IntTable, RobotEvidence
 
 #: times that one scan is repeated while odometry moves: not just sent twice
 REPEATED = 5

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from graphslam.core.arrays import stretches
 from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate
-from graphslam.slam.doubts import stretches
 from graphslam.slam.path_evidence import (
     NO_PATH,
     SPEEDS_M_S,

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config, FrontEndConfig
 from graphslam.core.geometry import Array, polar_points, transform_each, wrap
 from graphslam.core.records import Estimate, Scan
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.returns_on_walls import WallTree
 from graphslam.mapping.scan_to_map import ScanReturns, match_to_walls
-from graphslam.odometry.interpolation import BetterScans, IntArray
+from graphslam.odometry.interpolation import BetterScans
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.sweep_motion import undistorted_by_track
 from graphslam.perception.ordered_scan import beam_step, thinned

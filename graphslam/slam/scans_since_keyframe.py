@@ -12,13 +12,13 @@ from statistics import median
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config, FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov
 from graphslam.core.motion_models import Calibration
 from graphslam.core.records import Observation, Scan
 from graphslam.mapping.returns_on_walls import WallTree
 from graphslam.mapping.scan_to_map import LEAST_SHARE, TINY, ScanReturns, fit_to_walls
-from graphslam.odometry.interpolation import IntArray
 from graphslam.odometry.preintegration import Track
 from graphslam.perception.ordered_scan import scan_points, thinned
 from graphslam.slam.scans_between import BEAMS, can_match

@@ -13,11 +13,11 @@ from typing import TypeAlias
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, compose, compose_cov, inverse, inverse_cov, rotation3
 from graphslam.core.observation_models import MODELS, transport
 from graphslam.core.records import Association, Message, Motion, Observation, Sighting
 from graphslam.odometry.preintegration import Track, preintegrate_batch
-from graphslam.odometry.readings import IntArray
 from graphslam.perception.sightings import is_unnamed_robot, sighting_observation
 from graphslam.slam.synchronisation import ODOMETRY
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, inverse, polar_points
-from graphslam.odometry.interpolation import IntArray
 from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence, RobotEvidence, Seen
 

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.records import (
     Association,
@@ -22,7 +23,7 @@ from graphslam.core.records import (
 from graphslam.logs import LogSet
 from graphslam.logs.clock import to_common_clock
 from graphslam.odometry.preintegration import Track
-from graphslam.odometry.readings import IntArray, integrate_pending
+from graphslam.odometry.readings import integrate_pending
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
 from graphslam.slam.pipeline import Pipeline

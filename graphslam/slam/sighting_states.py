@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, exp, inverse, log, wrap
 from graphslam.core.motion_models import HELD_SIGMA
 from graphslam.core.observation_models import transport
@@ -26,7 +27,7 @@ from graphslam.core.records import (
 from graphslam.estimation.batch_calibration import uncovered_covs
 from graphslam.odometry.calibration_jacobian import at_estimated_motion
 from graphslam.odometry.increment_sums import Motions
-from graphslam.odometry.interpolation import IntArray, final_at
+from graphslam.odometry.interpolation import final_at
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, preintegrate_batch
 from graphslam.perception.sightings import sighting_observation
 from graphslam.slam.motion_noise import MIN_SIGMA

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, KeyframeScan
-from graphslam.odometry.interpolation import IntArray
 from graphslam.odometry.preintegration import Track
 
 #: scans that are looked at, at most: those in which the robot turns fastest

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.geometry import Array, between, polar_points, transform_each, wrap
-from graphslam.mapping.gating import BoolArray, IntArray
 from graphslam.slam.doubts import Reason, seconds
 from graphslam.slam.evidence import Evidence, RobotEvidence
 
