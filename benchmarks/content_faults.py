@@ -43,8 +43,8 @@ from graphslam.core.records import (
     WheelAngles,
 )
 from graphslam.logs import LogWriter, open_logs
+from graphslam.pipeline.robot_settings import make_tracks
 from graphslam.simulation import load_scenario, simulate
-from graphslam.slam.robot_settings import make_tracks
 from graphslam.slam.smooth import smooth
 
 S = 1_000_000_000

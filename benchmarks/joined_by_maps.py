@@ -36,12 +36,12 @@ from graphslam.multi_robot.anonymous_map import AnonymousMap
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.multi_robot.place_recognition import PlaceMap, relate_places
 from graphslam.multi_robot.relative_frames import RelativeFrame
+from graphslam.pipeline.log_pass import PriorKnowledge
+from graphslam.pipeline.pipeline import Pipeline
+from graphslam.pipeline.recorded_closures import judge_recorded_closures
+from graphslam.pipeline.start_priors import origin, start_poses
 from graphslam.results.folder import load
 from graphslam.slam.initialisation import anonymous_maps, separate_estimates
-from graphslam.slam.log_pass import PriorKnowledge
-from graphslam.slam.pipeline import Pipeline
-from graphslam.slam.recorded_closures import judge_recorded_closures
-from graphslam.slam.start_priors import origin, start_poses
 
 NAMES = ("first", "second")
 #: stretches of each half; two overlap if so many submaps are so near (m); limits of a correct start

@@ -21,7 +21,7 @@ from mcap.writer import Writer
 
 from graphslam.core.config import Config
 from graphslam.logs import open_logs
-from graphslam.slam.start_priors import first_truth
+from graphslam.pipeline.start_priors import first_truth
 
 SOURCE = DATA / "mrclam/MRCLAM_Dataset6.tar.xz"
 RUNS = {

@@ -26,9 +26,9 @@ from graphslam.core.geometry import Array, wrap
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.trajectory_metrics import pair_poses
 from graphslam.logs import open_logs, read_truth
+from graphslam.pipeline.start_priors import first_truth
 from graphslam.simulation import load_scenario
 from graphslam.simulation.robot_shapes import corners
-from graphslam.slam.start_priors import first_truth
 
 SCENARIO, OBSERVER, SEEN = "robots-in-scans", "vehicle", "pioneer"
 

@@ -182,10 +182,10 @@ def smooth(
     """
     from graphslam.core.memory_limit import limited_memory
     from graphslam.core.worker import Future
+    from graphslam.pipeline.progress import of_all
     from graphslam.results.target_folder import check_target
+    from graphslam.scan_smoothing.log_reader import receive_log
     from graphslam.slam.given_recording import read_ahead, settle
-    from graphslam.slam.log_reader import receive_log
-    from graphslam.slam.progress import of_all
 
     settled = settle(recording, config, settings)
     before = None
@@ -196,9 +196,9 @@ def smooth(
     with limited_memory(settled.limits.memory_mb), reading as ahead:
         # imported while the second process reads; what only that one needs is imported there
         from graphslam.core.stages import announce
+        from graphslam.pipeline.checkpoint import checkpoint
         from graphslam.results.folder import save
         from graphslam.results.known_map_file import known_map_files, known_map_of
-        from graphslam.slam.checkpoint import checkpoint
         from graphslam.slam.smooth import smooth
 
         if output is not None:  # for the processes that read the truth and draw the report
@@ -351,9 +351,9 @@ def compare(
     from graphslam.evaluation.compare_variants import parse_variants
     from graphslam.evaluation.ground_truth import truth_given, truth_of_logs
     from graphslam.evaluation.relation_metrics import relations_given
+    from graphslam.pipeline.progress import of_all
     from graphslam.results.target_folder import check_target
     from graphslam.slam.given_recording import opened, settle
-    from graphslam.slam.progress import of_all
 
     settled = settle(recording, config, settings)
     rows = parse_variants(backends.split(",") if isinstance(backends, str) else backends, settled)

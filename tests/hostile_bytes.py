@@ -24,7 +24,7 @@ from graphslam.core.errors import GraphSlamError
 from graphslam.core.record_codec import read, write
 from graphslam.core.records import Trajectory
 from graphslam.logs import IMPORTERS, open_logs
-from graphslam.slam.checkpoint import kinds
+from graphslam.pipeline.checkpoint import kinds
 
 ROOT = Path(__file__).parents[1]
 #: messages of logs/ that recordings are made of

@@ -156,6 +156,10 @@ class Truth(Message):
 # ---------------------------------------------------------------- input of an estimator
 
 
+#: what no estimate may see
+TRUE_RECORDS = (Truth, TrueLandmark)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion(Record):
     """How a robot moved from ``start_ns`` to ``end_ns`` according to its own sensors.

@@ -19,9 +19,9 @@ from graphslam.evaluation.relation_metrics import Relations
 from graphslam.evaluation.timed_replay import TimedReplay, growth_exponent, timed_replay_in_process
 from graphslam.evaluation.trajectory_metrics import PosePairs, align, pair_poses
 from graphslam.logs import GroundTruth, LogSet
+from graphslam.pipeline.log_pass import Progress
 from graphslam.results.folder import SavedResult
 from graphslam.results.report_comparison import BackendCurves, Comparison, ErrorCurve, TimedPath
-from graphslam.slam.log_pass import Progress
 
 FORMAT = "graphslam-comparison-1"
 #: the same recorded steps for all, or each with its own data association

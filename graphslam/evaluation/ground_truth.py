@@ -17,7 +17,7 @@ from graphslam.logs.sessions import open_recordings
 from graphslam.logs.topics import find_topics
 from graphslam.results.file_formats import read_trajectory
 from graphslam.results.folder import SavedResult
-from graphslam.slam.verdict import with_truth
+from graphslam.verdict.verdict import with_truth
 
 _NO_TRUTH = "holds no true poses or landmarks; give"
 

@@ -19,10 +19,10 @@ from graphslam.evaluation.metrics import evaluate, robots_in_own_frame
 from graphslam.evaluation.monte_carlo_paths import path_columns
 from graphslam.evaluation.trajectory_metrics import pair_poses
 from graphslam.logs import LogSet, open_logs
+from graphslam.pipeline.start_priors import first_truth
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Scenario
 from graphslam.slam.smooth import smooth
-from graphslam.slam.start_priors import first_truth
 
 #: keys of scenarios that a noise scale multiplies: all errors of the sensors
 NOISE = {

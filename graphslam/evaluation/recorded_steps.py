@@ -17,13 +17,13 @@ from graphslam.logs import LogSet
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.odometry.interpolation import FrameTransforms
+from graphslam.pipeline.log_pass import Progress
+from graphslam.pipeline.pipeline import Pipeline
+from graphslam.pipeline.robot_settings import check_robots
+from graphslam.pipeline.robot_state import RobotState
 from graphslam.results.folder import SavedResult, SavedRobot
 from graphslam.results.joint_file import joint_scans
 from graphslam.slam.initialisation import initialise
-from graphslam.slam.log_pass import Progress
-from graphslam.slam.pipeline import Pipeline
-from graphslam.slam.robot_settings import check_robots
-from graphslam.slam.robot_state import RobotState
 
 
 @dataclass(frozen=True, slots=True, eq=False)

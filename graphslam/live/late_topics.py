@@ -3,10 +3,9 @@
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 
-from graphslam.core.records import TrueAssociations
+from graphslam.core.records import TRUE_RECORDS, TrueAssociations
 from graphslam.logs.decoders import DECODERS
 from graphslam.logs.recording import RawMessage, RawTopic
-from graphslam.slam.log_reader import TRUE_RECORDS
 
 #: what is never followed
 _TRUE = (*TRUE_RECORDS, TrueAssociations)

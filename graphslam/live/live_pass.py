@@ -1,7 +1,7 @@
 """The pass over messages that are still to come: it keeps what its window needs, and no history.
 
-The stages are those of `graphslam.slam.pipeline`, the back end is a fixed-lag smoother. Memory is
-that of the window, of the map and of one small table of the states' times.
+The stages are those of `graphslam.pipeline.pipeline`, the back end is a fixed-lag smoother. Memory
+is that of the window, of the map and of one small table of the states' times.
 """
 
 import math
@@ -19,11 +19,11 @@ from graphslam.estimation.fixed_lag import FixedLagBackend, Restart
 from graphslam.live.loop_closing import LoopCloser
 from graphslam.logs import LogSet
 from graphslam.mapping.landmark_records import make_landmarks
-from graphslam.slam.log_pass import PriorKnowledge
-from graphslam.slam.pipeline import Pipeline
-from graphslam.slam.robot_state import RobotState
-from graphslam.slam.sighting_batches import Event, SightingBatch
-from graphslam.slam.synchronisation import ODOMETRY
+from graphslam.pipeline.log_pass import PriorKnowledge
+from graphslam.pipeline.pipeline import Pipeline
+from graphslam.pipeline.robot_state import RobotState
+from graphslam.pipeline.sighting_batches import Event, SightingBatch
+from graphslam.pipeline.synchronisation import ODOMETRY
 
 #: keyframes in a row after which places are compared; else that waits for a scan that becomes none
 BUSY = 2

@@ -12,7 +12,7 @@ from typing import Any
 from graphslam.core.config import Config
 from graphslam.core.config_io import chosen_config
 from graphslam.core.errors import ConfigError, EstimationError, LogError
-from graphslam.core.records import Landmark, Message, Scan, Sighting
+from graphslam.core.records import TRUE_RECORDS, Landmark, Message, Scan, Sighting
 from graphslam.core.suggestions import start_option
 from graphslam.live.live_pass import LiveEstimate, LivePass
 from graphslam.live.repeated_messages import without_repeated
@@ -22,12 +22,11 @@ from graphslam.logs.record_checks import UnusableMessageError, checked
 from graphslam.logs.time_order import DROPPED, TOO_LATE, MessageSorter
 from graphslam.logs.topics import MOTION_KINDS, ODOMETRY_KINDS, Topic
 from graphslam.multi_robot.frame_tree import FrameAssignment
+from graphslam.pipeline.log_pass import PriorKnowledge
+from graphslam.pipeline.recorded_closures import RecordedClosures
+from graphslam.pipeline.robot_settings import check_robots
+from graphslam.pipeline.start_priors import origin, start_poses
 from graphslam.results.known_map_file import known_map_of
-from graphslam.slam.log_pass import PriorKnowledge
-from graphslam.slam.log_reader import TRUE_RECORDS
-from graphslam.slam.recorded_closures import RecordedClosures
-from graphslam.slam.robot_settings import check_robots
-from graphslam.slam.start_priors import origin, start_poses
 
 #: s of messages by which the robots and their sensors are known, if nobody tells them
 INTRODUCTION_S = 2.0

@@ -1,1 +1,1 @@
-"""From a log to a `Result`: `smooth.smooth` is the main job, `pipeline` one pass over a log."""
+"""From a log to a `Result`: `smooth.smooth` is the main job, for logs of all kinds."""

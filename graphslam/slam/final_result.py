@@ -17,13 +17,13 @@ from graphslam.estimation.settled import settled
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.odometry.mount_covariance import with_mount_errors
-from graphslam.slam.evidence import gather
-from graphslam.slam.log_pass import LogPass, timed
-from graphslam.slam.passes import FinishedPass
+from graphslam.pipeline.findings import FinishedPass
+from graphslam.pipeline.log_pass import LogPass, timed
+from graphslam.pipeline.scans_between import walls_of_frames
 from graphslam.slam.retirement import retired_landmarks
-from graphslam.slam.scans_between import walls_of_frames
 from graphslam.slam.summary import summarise
-from graphslam.slam.verdict import judge
+from graphslam.verdict.evidence import gather
+from graphslam.verdict.verdict import judge
 
 #: scans that a result keeps for pictures, at most
 MAX_PICTURES = 4000

@@ -13,7 +13,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.logs import LogSet, open_logs
 
 if TYPE_CHECKING:
-    from graphslam.slam.log_reader import Reading
+    from graphslam.scan_smoothing.log_reader import Reading
 
 PathLike: TypeAlias = "str | os.PathLike[str]"
 Recording: TypeAlias = "PathLike | Sequence[PathLike] | LogSet"
@@ -52,7 +52,7 @@ def opened(recording: Recording, config: Config) -> LogSet:
 
 def read_ahead(recording: Recording, config: Config) -> Reading | None:
     """The logs and what follows in them, from the background; None if they are open already."""
-    from graphslam.slam.log_reader import open_ahead  # noqa: PLC0415 (not needed by who compares)
+    from graphslam.scan_smoothing.log_reader import open_ahead  # noqa: PLC0415 (not needed by who compares)
 
     if isinstance(recording, LogSet):
         return None

@@ -28,13 +28,13 @@ from graphslam.multi_robot.mutual_detection import (
 )
 from graphslam.multi_robot.place_recognition import PlaceMap
 from graphslam.multi_robot.relative_frames import RelativeFrame, RobotEstimate
-from graphslam.slam.log_pass import PriorKnowledge
-from graphslam.slam.pipeline import CLOCK_OFFSET_SIGMA_S, Pipeline
-from graphslam.slam.recorded_closures import RecordedClosures, judge_recorded_closures
-from graphslam.slam.robot_settings import outlines
-from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
-from graphslam.slam.sighting_solution import solve_robots_apart
-from graphslam.slam.start_priors import origin, start_poses
+from graphslam.pipeline.log_pass import PriorKnowledge
+from graphslam.pipeline.pipeline import CLOCK_OFFSET_SIGMA_S, Pipeline
+from graphslam.pipeline.recorded_closures import RecordedClosures, judge_recorded_closures
+from graphslam.pipeline.robot_settings import outlines
+from graphslam.pipeline.start_priors import origin, start_poses
+from graphslam.sighting_smoothing.sighting_pass import SightingPass, can_solve_at_once
+from graphslam.sighting_smoothing.sighting_solution import solve_robots_apart
 
 #: relative frames found without identities, and robot -> why it has none
 Found = tuple[Sequence[RelativeFrame], Mapping[str, str]]

@@ -4,10 +4,8 @@ Mostly one pass is enough. What it finds may show that the log should be read ag
 identities that were swapped, or robots' clocks that differ.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
@@ -18,46 +16,19 @@ from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.logs import LogSet
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.robot_candidates import NOT_THERE
+from graphslam.mapping.robot_gating import RobotOffers
 from graphslam.multi_robot.identity_swaps import find_swapped_identities
-from graphslam.slam.causal import causal_of
-from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
+from graphslam.pipeline.checkpoint import NOTHING_KEPT, Checkpoint
+from graphslam.pipeline.findings import Findings, FinishedPass
+from graphslam.pipeline.log_pass import LogPass, PriorKnowledge, Progress, timed
+from graphslam.pipeline.pipeline import Pipeline
+from graphslam.scan_smoothing.causal import causal_of
+from graphslam.scan_smoothing.reoptimise_scans import reoptimise_scan_log
+from graphslam.sighting_smoothing.unnamed_sightings import solve_unnamed
 from graphslam.slam.initialisation import with_identities
-from graphslam.slam.log_pass import LogPass, PriorKnowledge, Progress, timed
-from graphslam.slam.pipeline import Pipeline
-from graphslam.slam.reoptimise_scans import reoptimise_scan_log
-from graphslam.slam.robot_gating import RobotOffers
-from graphslam.slam.robot_state import Causal
-from graphslam.slam.unnamed_sightings import solve_unnamed
 
 #: how often a log is read again at most, with corrected clocks
 MAX_CLOCK_PASSES = 1
-
-
-class Findings(NamedTuple):
-    """Results of a pass besides its estimate.
-
-    ``swapped_identities``: false identity -> right one; ``clocks``: the
-    robots' clocks as their sightings of each other show them; ``causal``: causal trajectories.
-    """
-
-    swapped_identities: Mapping[str, str]
-    clocks: Mapping[str, ClockEstimate]
-    causal: Mapping[str, Causal]
-
-
-class FinishedPass(NamedTuple):
-    """The last pass over a log, its final estimate and what it found.
-
-    ``is_settled``: the estimate is at the minimum of the steps, see `graphslam.estimation.settled`.
-    ``causal_later``: waits for the causal trajectories and gives them, where they are not in the
-    findings yet.
-    """
-
-    pipeline: LogPass
-    estimate: Estimate
-    findings: Findings
-    is_settled: bool = False
-    causal_later: Callable[[], Mapping[str, Causal]] | None = None
 
 
 def run_passes(

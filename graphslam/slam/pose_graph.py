@@ -16,6 +16,7 @@ from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.records import (
+    TRUE_RECORDS,
     Closure,
     Estimate,
     Motion,
@@ -31,19 +32,19 @@ from graphslam.estimation.replay import replay
 from graphslam.logs import LogSet
 from graphslam.odometry.given_increments import consecutive_motions
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.initialisation import estimate_start_poses
-from graphslam.slam.log_pass import PriorKnowledge, Progress, counted, timed
-from graphslam.slam.log_reader import TRUE_RECORDS
-from graphslam.slam.passes import Findings, FinishedPass, pass_findings
-from graphslam.slam.pipeline import Pipeline
-from graphslam.slam.recorded_closures import (
+from graphslam.pipeline.findings import Findings, FinishedPass
+from graphslam.pipeline.log_pass import PriorKnowledge, Progress, counted, timed
+from graphslam.pipeline.pipeline import Pipeline
+from graphslam.pipeline.recorded_closures import (
     accept_closures,
     closure_id,
     take_relative_poses,
 )
-from graphslam.slam.robot_settings import make_tracks
-from graphslam.slam.robot_state import RobotState
-from graphslam.slam.start_priors import start_poses
+from graphslam.pipeline.robot_settings import make_tracks
+from graphslam.pipeline.robot_state import RobotState
+from graphslam.pipeline.start_priors import start_poses
+from graphslam.slam.initialisation import estimate_start_poses
+from graphslam.slam.passes import pass_findings
 
 #: keyframes' distances up to which poses between two states follow from these
 BRIDGED_KEYFRAMES = 10

@@ -5,7 +5,7 @@ from typing import Any
 
 from graphslam.core.records import Estimate, Landmark
 from graphslam.mapping.retired_landmarks import seen_through
-from graphslam.slam.log_pass import LogPass
+from graphslam.pipeline.log_pass import LogPass
 
 
 def retired_landmarks(

@@ -10,26 +10,21 @@ from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import clocks_from_paths
 from graphslam.estimation.settled import settled
 from graphslam.logs import LogSet
-from graphslam.slam.causal_sightings import CausalReplay, replay_causally
-from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
-from graphslam.slam.initialisation import with_identities
-from graphslam.slam.log_pass import PriorKnowledge, Progress, timed
-from graphslam.slam.passes import (
-    Findings,
-    FinishedPass,
-    decide_next_pass,
-    find_clocks,
-    find_swapped_names,
-)
-from graphslam.slam.robot_state import Causal
-from graphslam.slam.rough_solution import is_misfit
-from graphslam.slam.sighting_pass import SightingPass, can_solve_at_once
-from graphslam.slam.sighting_solution import (
+from graphslam.pipeline.checkpoint import NOTHING_KEPT, Checkpoint
+from graphslam.pipeline.findings import Findings, FinishedPass
+from graphslam.pipeline.log_pass import PriorKnowledge, Progress, timed
+from graphslam.pipeline.robot_state import Causal
+from graphslam.sighting_smoothing.causal_sightings import CausalReplay, replay_causally
+from graphslam.sighting_smoothing.rough_solution import is_misfit
+from graphslam.sighting_smoothing.sighting_pass import SightingPass, can_solve_at_once
+from graphslam.sighting_smoothing.sighting_solution import (
     solve_finely,
     solve_roughly,
     solve_without_contradiction,
     with_gated_robots,
 )
+from graphslam.slam.initialisation import with_identities
+from graphslam.slam.passes import decide_next_pass, find_clocks, find_swapped_names
 
 
 def run_sighting_passes(

@@ -10,16 +10,18 @@ from graphslam.core.records import Result
 from graphslam.logs import LogSet
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.loop_closure import Tamper
-from graphslam.slam.checkpoint import NOTHING_KEPT, Checkpoint
+from graphslam.pipeline.checkpoint import NOTHING_KEPT, Checkpoint
+from graphslam.pipeline.findings import FinishedPass
+from graphslam.pipeline.log_kind import is_scan_log, is_session_log
+from graphslam.pipeline.log_pass import Progress
+from graphslam.pipeline.robot_settings import check_robots
+from graphslam.scan_smoothing.log_reader import Reading
+from graphslam.scan_smoothing.scan_log import solve_scan_log
+from graphslam.scan_smoothing.session_log import solve_session_log
 from graphslam.slam.final_result import make_result
 from graphslam.slam.initialisation import initialise
-from graphslam.slam.log_pass import Progress
-from graphslam.slam.log_reader import Reading, is_scan_log, is_session_log
-from graphslam.slam.passes import FinishedPass, run_passes
+from graphslam.slam.passes import run_passes
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
-from graphslam.slam.robot_settings import check_robots
-from graphslam.slam.scan_log import solve_scan_log
-from graphslam.slam.session_log import solve_session_log
 from graphslam.slam.sighting_passes import run_sighting_passes
 
 
@@ -39,7 +41,7 @@ def smooth(
         config: settings.
         progress: called with the number of messages read so far.
         tamper: for tests, see `graphslam.mapping.loop_closure.Tamper`.
-        ahead: what `graphslam.slam.log_reader.open_ahead` gives after the log.
+        ahead: what `graphslam.scan_smoothing.log_reader.open_ahead` gives after the log.
         kept: where stages are kept, and those of an earlier run.
         known_map: of an earlier result, in which the log is localised.
 

@@ -18,12 +18,12 @@ from graphslam.core.geometry import compose
 from graphslam.core.records import Estimate
 from graphslam.core.suggestions import start_option
 from graphslam.estimation.clock_calibration import ClockEstimate
+from graphslam.estimation.motion_noise import understated_noise
 from graphslam.logs import LogSet
 from graphslam.odometry.several_lasers import SeveralLasersTrack
-from graphslam.slam.log_pass import LogPass
-from graphslam.slam.motion_noise import understated_noise
-from graphslam.slam.robot_settings import robot_settings
-from graphslam.slam.robot_state import RobotState, span_warnings
+from graphslam.pipeline.log_pass import LogPass
+from graphslam.pipeline.robot_settings import robot_settings
+from graphslam.pipeline.robot_state import RobotState, span_warnings
 
 FORMAT = "graphslam-result-1"
 

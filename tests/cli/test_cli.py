@@ -545,7 +545,7 @@ def test_a_log_is_being_read_before_what_only_the_estimate_needs_is_imported(tmp
     """Importing that takes as long as a fifth of a small log; meanwhile the log can be read."""
     code = (
         "import sys, graphslam.cli\n"
-        "from graphslam.slam import log_reader\n"
+        "from graphslam.scan_smoothing import log_reader\n"
         "log_reader.open_ahead = lambda *_: sys.exit(' '.join(sys.modules))\n"
         f"graphslam.cli.main(['smooth', 'logs/lab.mcap', '-o', {str(tmp_path / 'out')!r}])"
     )

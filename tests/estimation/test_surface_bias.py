@@ -16,7 +16,7 @@ from graphslam.estimation.joint_covariances import joint_covariance
 from graphslam.estimation.surface_bias import COMMON, bias_of_lines, surface_errors
 from graphslam.estimation.weighed_walls import WeighedWalls
 from graphslam.perception.line_fit import fit_lines
-from graphslam.slam import batch_optimisation
+from graphslam.scan_smoothing import batch_optimisation
 
 BIAS_M = 0.002
 #: equal weights

@@ -44,9 +44,9 @@ from graphslam.evaluation.monte_carlo_log_run import (
 )
 from graphslam.evaluation.monte_carlo_summary import bootstrap_interval, summarise
 from graphslam.logs import open_logs
+from graphslam.pipeline.start_priors import start_poses
 from graphslam.results.report_experiment import experiment_figures, experiment_page
 from graphslam.simulation import SCENARIOS, load_scenario, simulate
-from graphslam.slam.start_priors import start_poses
 
 WHOLE = load_definition("ekf-versus-smoothing")
 

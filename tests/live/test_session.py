@@ -12,7 +12,7 @@ from graphslam.core.geometry import between, compose
 from graphslam.core.records import Closure, OdometryPose, Scan, Sighting, Truth, WheelAngles
 from graphslam.live import live_pass
 from graphslam.logs import LogWriter
-from graphslam.slam import step_recorder
+from graphslam.pipeline import step_recorder
 
 HORIZON_S = 8.0
 S = 1_000_000_000

@@ -23,7 +23,7 @@ from graphslam.logs.decoders import TopicContext, decode_messages
 from graphslam.logs.import_csv import import_csv
 from graphslam.logs.importers import IMPORTERS
 from graphslam.logs.recording import raw_messages
-from graphslam.slam.robot_state import times_of_readings
+from graphslam.pipeline.robot_state import times_of_readings
 from tests import mutations
 from tests.recordings import bag, rosbag2
 

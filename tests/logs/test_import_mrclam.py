@@ -13,7 +13,7 @@ from graphslam.core.errors import LogError
 from graphslam.core.geometry import compose, exp
 from graphslam.logs import IMPORTERS, open_logs, read_truth
 from graphslam.logs.import_mrclam import COMMANDED, MAX_ARC_NS
-from graphslam.slam.robot_settings import odometry_settings
+from graphslam.pipeline.robot_settings import odometry_settings
 
 START = 1248444187
 

@@ -7,7 +7,7 @@ from graphslam.core.config import Config, OdometryConfig
 from graphslam.core.geometry import compose, exp
 from graphslam.logs import LogWriter, open_logs
 from graphslam.odometry.noise_estimation import motion_variances, without_floors
-from graphslam.slam.robot_settings import make_tracks
+from graphslam.pipeline.robot_settings import make_tracks
 
 PERIOD_NS = 100_000_000
 SIGMAS = np.array([0.05, 0.01, 0.08])

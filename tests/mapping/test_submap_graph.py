@@ -8,7 +8,7 @@ from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import between, compose, log, rotate_cov
 from graphslam.estimation import factors
 from graphslam.mapping.submap_graph import SubmapConstraints, SubmapGraph
-from graphslam.slam.path_closing import LandmarkUncertainty, follow
+from graphslam.scan_smoothing.path_closing import LandmarkUncertainty, follow
 
 START = 1e-8 * np.eye(3)[None]
 COV = np.diag([0.05, 0.03, 0.02]) ** 2

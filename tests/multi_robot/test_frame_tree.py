@@ -14,9 +14,9 @@ from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Trajectory
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import IMPORTERS, LogWriter, open_logs, read_truth
+from graphslam.pipeline.start_priors import first_truth
 from graphslam.results.folder import load, save
 from graphslam.slam.smooth import smooth
-from graphslam.slam.start_priors import first_truth
 
 SEEDS = (1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3)))
 

@@ -10,7 +10,7 @@ from graphslam.core import worker
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import wrap
 from graphslam.logs import open_logs
-from graphslam.slam import state_per_step
+from graphslam.sighting_smoothing import state_per_step
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.sighting_passes import run_sighting_passes
 from graphslam.slam.smooth import smooth

@@ -27,8 +27,8 @@ from graphslam.logs import LogWriter, open_logs
 from graphslam.mapping.landmark_map import seen_extents
 from graphslam.odometry.interpolation import origin_shift, transform_trajectory
 from graphslam.odometry.preintegration import Track
-from graphslam.slam.pipeline import Pipeline
-from graphslam.slam.robot_state import RobotState
+from graphslam.pipeline.pipeline import Pipeline
+from graphslam.pipeline.robot_state import RobotState
 from graphslam.slam.smooth import initialise, smooth
 
 S = 1_000_000_000

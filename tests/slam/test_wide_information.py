@@ -15,8 +15,8 @@ from graphslam.estimation.initial_estimate import initial_estimate
 from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.logs import IMPORTERS, LogWriter, open_logs
 from graphslam.odometry.given_increments import consecutive_motions
-from graphslam.slam.recorded_closures import take_relative_poses
-from graphslam.slam.robot_settings import make_tracks
+from graphslam.pipeline.recorded_closures import take_relative_poses
+from graphslam.pipeline.robot_settings import make_tracks
 from graphslam.slam.smooth import smooth
 
 

@@ -1,0 +1,227 @@
+"""How noisy the sightings and the odometry of a log are, by a stretch of the log itself.
+
+A part of the log is solved with a state wherever something was seen, its noise is measured from
+the residuals, and it is solved again until the noise no longer changes. Two things are told apart:
+noise that is new in every sighting, and errors that sightings of one target share for seconds.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.core.config import Config
+from graphslam.core.geometry import Array
+from graphslam.core.records import Estimate, Sighting, Start, Step
+from graphslam.estimation.calibration_graph import CalibrationGraph
+from graphslam.estimation.log_noise import MOTION, LogNoise, has_state_at_every_sighting, is_white
+from graphslam.estimation.motion_noise import (
+    BEGIN_SIGMA,
+    NoiseFit,
+    fit_track_noise,
+    measured_motion_noise,
+)
+from graphslam.estimation.posterior_residuals import Posterior
+from graphslam.estimation.recorded_graph import ObservationNoise, Source
+from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
+from graphslam.odometry.noise_estimation import is_stated, with_fit_uncertainty, without_floors
+from graphslam.odometry.preintegration import Track
+from graphslam.sighting_smoothing.sensor_latency import hold_insignificant_latency
+from graphslam.sighting_smoothing.sighting_states import (
+    at_states,
+    state_times,
+    steps_at_sightings,
+    with_motions,
+)
+
+#: sightings in the stretch, about
+MAX_SIGHTINGS = 5000
+#: rounds at most; the noise has converged when no variance changes by a larger share
+MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
+#: relative decrease of the error at which optimisation ends
+CONVERGED_ERROR = 1e-4
+#: smallest factor on a stated variance on the way, for logs without noise
+MIN_VARIANCE = 1e-4
+#: rad: a bearing that is stated to be less certain was not measured
+UNKNOWN_BEARING_RAD = 1.0
+#: sightings without which nothing is said about a source
+MIN_MEASUREMENTS = 100
+
+
+def estimate_noise(
+    steps: Sequence[Step],
+    sources: Sequence[Sighting],
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    config: Config,
+    rounds: int = MAX_ROUNDS,
+) -> LogNoise:
+    """The noise of a log of sightings.
+
+    Args:
+        steps: of the log.
+        sources: `Association.source` is an index into them.
+        estimate: of the states and landmarks of ``steps``.
+        tracks: odometry of every robot; they get the calibration that is found on the way.
+        config: settings.
+        rounds: at most. Errors that are shared show in the first, which is the last then.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    chosen = stretch(steps)
+    sample = steps_at_sightings(chosen, sources, {}, Counter())
+    tracks = {name: tracks[name] for name in state_times(sample)}
+    estimate = at_states(estimate, sample, tracks)
+    before = {name: track.config for name, track in tracks.items()}
+    try:
+        noise = _estimated(sample, estimate, tracks, config, rounds)
+        if len(chosen) > len(steps):  # with the starts apart
+            noise = replace(noise, of_whole_log=True)
+        if noise.of_whole_log or not has_state_at_every_sighting(noise.sightings):
+            for track in tracks.values():  # else a solution of the whole log decides
+                hold_insignificant_latency(track)
+        return noise
+    finally:
+        for name, track in tracks.items():
+            track.config = before[name]
+
+
+def stretch(steps: Sequence[Step]) -> tuple[Step, ...]:
+    """Steps in the middle of a log with about so many sightings, starts of robots before them."""
+    seen = np.cumsum([len(step.associations) for step in steps])
+    spare = max(0, int(seen[-1]) - MAX_SIGHTINGS)
+    first, last = np.searchsorted(seen, [spare // 2, spare // 2 + MAX_SIGHTINGS]).tolist()
+    chosen = steps[first : last + 1]
+    starts = {robot: start for step in steps[: last + 1] for robot, start in step.starts.items()}
+    begin_ns = min((chosen[0].time_ns, *(s.time_ns for s in chosen if s.associations)))
+    rest = tuple(Step(s.time_ns, {}, s.motions, s.associations) for s in chosen)
+    return (Step(begin_ns, starts), *rest)
+
+
+def _beginning_at(steps: Sequence[Step], estimate: Estimate) -> tuple[Step, ...]:
+    """Steps whose robots start at the estimate."""
+    cov = np.diag([BEGIN_SIGMA**2] * 3)
+
+    def begun(robot: str, time_ns: int) -> Start:
+        return Start(estimate.states[robot].at(time_ns), cov)
+
+    return tuple(
+        replace(step, starts={robot: begun(robot, step.time_ns) for robot in step.starts})
+        for step in steps
+    )
+
+
+def _estimated(
+    steps: Sequence[Step],
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    config: Config,
+    rounds: int,
+) -> LogNoise:
+    """`estimate_noise` of all ``steps``; changes the tracks."""
+    priors = {name: track.prior for name, track in tracks.items()}
+    one = np.ones(2)
+    sources = {(a.robot, a.model) for s in steps for a in s.associations if len(a.z) == 2}
+    noise = {source: ObservationNoise(one, one, config.robust.scale) for source in sources}
+    stated = {name for name, track in tracks.items() if is_stated(track)}
+    for name in stated:
+        tracks[name].config = without_floors(tracks[name].config)
+    measured: dict[Source, Array] = {}
+    fits: dict[str, NoiseFit | None] = {}
+    for _ in range(rounds):
+        initial = {name: track.calibration for name, track in tracks.items()}
+        for track in tracks.values():
+            track.calibration = track.calibration.held()
+        made = with_motions(_beginning_at(steps, estimate), tracks, estimate)
+        graph = CalibrationGraph(
+            made, estimate, priors, initial, config.robust, noise, calibrated=True
+        )
+        estimate, calibrations = graph.solve(CONVERGED_ERROR)
+        posterior = graph.posterior()
+        new = _sighting_noise(posterior, noise)
+        change = _largest_change(noise, new)
+        noise = new
+        covs = graph.calibration_covariances(posterior)
+        for name, track in tracks.items():
+            track.calibration = replace(calibrations[name], cov=covs[name])
+            if name in stated:
+                factors = measured_motion_noise(track, name, posterior)
+                if factors is not None:
+                    measured[name, MOTION] = factors
+                continue
+            fit = fits[name] = fit_track_noise(track, name, posterior, relax=is_white(noise))
+            track.config = without_floors(track.config)
+            change = max(change, fit.change if fit else 0.0)
+        if change < CONVERGED_SHARE or not is_white(noise):
+            break
+    for name, fit in fits.items():
+        if fit is not None:
+            tracks[name].config = with_fit_uncertainty(tracks[name].config, fit.log_sigma)
+    for source, found in noise.items():
+        measured[source] = found.white + found.shared
+    final = {source: _cautious(found, config) for source, found in noise.items()}
+    return LogNoise(final, {name: track.config for name, track in tracks.items()}, measured)
+
+
+def _sighting_noise(
+    posterior: Posterior, noise: Mapping[Source, ObservationNoise]
+) -> dict[Source, ObservationNoise]:
+    """The noise of each source by its residuals.
+
+    A robot's sightings of robots are taken as noisy as those of landmarks, if it has these: the
+    robots' paths can take up more of their errors.
+    """
+    new = {}
+    for source, before in noise.items():
+        robot, model = source
+        if model != "point" and (robot, "point") in noise:
+            continue
+        residuals = posterior.sightings(source)
+        if len(residuals.residual) < MIN_MEASUREMENTS:
+            new[source] = ObservationNoise(np.ones(2), np.zeros(2), before.kernel_scale)
+            continue
+        found, shared = fit_distribution(residuals.normalised), posterior.shared(source)
+        part = np.zeros(2) if shared is None else shared_variance(shared) * before.shared
+        least = np.where(_is_measured(posterior, source), MIN_VARIANCE, 1.0)
+        white = np.maximum(found.variance * before.white, least)
+        new[source] = ObservationNoise(white, part, found.kernel_scale)
+    for source in noise.keys() - new.keys():
+        new[source] = new[source[0], "point"]
+    return new
+
+
+def _is_measured(posterior: Posterior, source: Source) -> Array:
+    """Whether the bearings and the ranges (2,) of a source are stated to be measured at all.
+
+    A sigma as large as the ranges themselves, or of a radian, says that they are not: a camera that
+    sees bearings alone writes some constant as range. Its residuals are far below such a sigma, as
+    the constant has about the right size, and tell nothing of a measurement.
+    """
+    seen = [a for *_, a in posterior.builder.bearings_and_ranges[source]]
+    sigmas = np.sqrt([np.diag(a.cov) for a in seen])
+    ranges = np.array([a.z[1] for a in seen])
+    return np.asarray(np.median(sigmas, axis=0) < [UNKNOWN_BEARING_RAD, np.median(ranges)])
+
+
+def _cautious(found: ObservationNoise, config: Config) -> ObservationNoise:
+    """Noise that is not less than what is stated.
+
+    Of slow errors the robots' paths take up a part: where there are any, what is stated and does
+    not show in the residuals is taken for slow. Where bearings or ranges show none, it is open
+    whether they have such an error or have less noise than stated, and half of it is.
+    """
+    if not found.shared.any():
+        return replace(found, white=np.maximum(found.white, 1.0))
+    hidden = np.where(found.shared > 0.0, 1.0, 0.5) * (1.0 - found.white)
+    return ObservationNoise(found.white, np.maximum(found.shared, hidden), config.robust.scale)
+
+
+def _largest_change(
+    before: Mapping[Source, ObservationNoise], after: Mapping[Source, ObservationNoise]
+) -> float:
+    """Largest share by which a white variance has changed."""
+    return max(
+        (float(np.abs(after[s].white / before[s].white - 1.0).max()) for s in after), default=0.0
+    )

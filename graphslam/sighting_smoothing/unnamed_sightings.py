@@ -1,0 +1,114 @@
+"""A log of sightings without identities, solved again once it is associated.
+
+While the log is read, a filter associates: a landmark that it does not recognise is in the map
+twice. Solved as a whole, with the noise that the log shows, the states are accurate enough to tell
+which landmarks are one, and which of them each sighting is of.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphslam.core.records import Estimate, Step
+from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
+from graphslam.mapping.point_reassociation import PointSightings, is_point, reassociated
+from graphslam.pipeline.log_pass import LogPass
+from graphslam.sighting_smoothing.sighting_noise import estimate_noise
+from graphslam.sighting_smoothing.state_at_every_sighting import SightingProblem
+from graphslam.sighting_smoothing.state_per_step import SteppedProblem, sighting_problem
+
+#: rounds of solving and associating again: the third moves one sighting in a hundred at most
+MAX_ROUNDS = 3
+#: share of the sightings that still move, below which another round is not worth it
+SETTLED_SHARE = 1e-3
+
+
+def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Step, ...]]:
+    """A log of associated sightings solved again, and the steps behind it.
+
+    Args:
+        one: the pass that associated them; its landmarks, states and calibrations follow.
+        estimate: of its steps.
+
+    Raises:
+        EstimationError: the estimate is indeterminate.
+    """
+    config, landmarks = one.config, one.landmarks
+    tracks = {name: run.track for name, run in one.started.items()}
+    if not config.odometry.calibrate:
+        return estimate, tuple(one.steps)
+    noise = estimate_noise(one.steps, one.sources, estimate, tracks, config)
+    one.noise = noise.to_summary()
+    problem, estimate = sighting_problem(one, estimate, noise)
+    steps, before = problem.steps, len(estimate.landmarks)
+    points = {
+        i
+        for i in estimate.landmarks
+        if landmarks.entries[i].identity is None and landmarks.entries[i].kind == "point"
+    }
+    for _ in range(MAX_ROUNDS if points else 0):
+        estimate, _ = problem.solve(steps, estimate, rough=True)
+        steps, estimate, moved, count = _associated_again(problem, steps, estimate, points)
+        one.counts["observations_reassociated"] += moved
+        if moved <= SETTLED_SHARE * count:
+            break
+    estimate, solved = problem.finish(one, steps, estimate)
+    one.counts["landmarks_merged"] += before - len(estimate.landmarks)
+    landmarks.update_from(solved, estimate)
+    _count_sightings(landmarks, solved, points)
+    return estimate, solved
+
+
+def _associated_again(
+    problem: SightingProblem | SteppedProblem,
+    steps: tuple[Step, ...],
+    estimate: Estimate,
+    points: Collection[int],
+) -> tuple[tuple[Step, ...], Estimate, int, int]:
+    """Steps with every sighting of ``points`` at the one that it fits best; their estimate.
+
+    Also how many sightings have moved, and of how many.
+    """
+    fine, there = problem.at_sightings(steps, estimate)
+    points = points & estimate.landmarks.keys()
+    seen = PointSightings.of(fine, there, points)
+    if not len(seen.target):
+        return steps, estimate, 0, 0
+    found = reassociated(seen, {i: estimate.landmarks[i][0] for i in points})
+    sources = [a.source for step in fine for a in step.associations if is_point(a, points)]
+    targets = dict(zip(sources, found.tolist(), strict=True))
+    steps = _retargeted(steps, targets)
+    placed = mean_landmarks(_retargeted(fine, targets), there.states)
+    kept = {i: placed.get(i, found) for i, found in estimate.landmarks.items()}
+    kept = {i: found for i, found in kept.items() if i in placed or i not in points}
+    moved = int(np.count_nonzero(found != seen.target))
+    return steps, replace(estimate, landmarks=kept), moved, len(found)
+
+
+def _retargeted(steps: Sequence[Step], targets: Mapping[int | None, int]) -> tuple[Step, ...]:
+    """Steps whose sightings are of other landmarks; ``targets`` by `Association.source`."""
+    return tuple(
+        replace(
+            step,
+            associations=tuple(
+                replace(a, target=targets[a.source]) if a.source in targets else a
+                for a in step.associations
+            ),
+        )
+        for step in steps
+    )
+
+
+def _count_sightings(
+    landmarks: LandmarkMap, steps: Sequence[Step], points: Collection[int]
+) -> None:
+    """Set how often and when ``points`` of the map were seen."""
+    times: dict[int, list[int]] = {}
+    for step in steps:
+        for a in step.associations:
+            if is_point(a, points):
+                times.setdefault(int(a.target), []).append(a.time_ns)
+    for number, seen in times.items():
+        entry = landmarks.entries[number]
+        entry.sightings, entry.first_ns, entry.last_ns = len(seen), min(seen), max(seen)

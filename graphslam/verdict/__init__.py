@@ -1,0 +1,1 @@
+"""Whether a result can be trusted: evidence, doubts by subject, and the verdict of them all."""
