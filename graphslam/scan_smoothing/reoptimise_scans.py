@@ -13,12 +13,11 @@ from functools import partial
 
 import numpy as np
 
-from graphslam.core.config import Config
-from graphslam.core.geometry import Array, compose, inverse, rotate_cov
+from graphslam.core.config import AssociationConfig, Config
+from graphslam.core.geometry import compose, inverse, rotate_cov
 from graphslam.core.records import Closure, Estimate, KeyframeScan, Start, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate, recompute_motions
 from graphslam.estimation.calibration_graph import CalibratedSolution
-from graphslam.estimation.isam2 import Reoptimiser
 from graphslam.estimation.joint_covariances import mount_errors
 from graphslam.estimation.log_noise import LogNoise
 from graphslam.estimation.motion_noise import fit_motion_noise, noise_scales, scale_motion_noise
@@ -29,24 +28,13 @@ from graphslam.mapping.duplicate_landmarks import (
     seen_together,
 )
 from graphslam.mapping.landmark_map import LandmarkMap
-from graphslam.mapping.loop_closure import (
-    ALREADY_CLOSED,
-    MAX_RESIDUAL,
-    Pair,
-    PairVerifier,
-    Tamper,
-    consistent_closures,
-    inflate_covariances,
-    loop_closures,
-    residuals,
-    violated,
-)
+from graphslam.mapping.loop_closure import ALREADY_CLOSED, Tamper, violated
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.robot_gating import RobotOffers
-from graphslam.mapping.submaps import build_submaps, with_poses_from
-from graphslam.mapping.visits import rejoin_visits, split_by_visit
 from graphslam.odometry.interpolation import origin_shift
 from graphslam.odometry.preintegration import Track
+from graphslam.scan_smoothing.solver import Solver
+from graphslam.scan_smoothing.submap_closing import close_loops
 
 #: factors on the gates of re-association (across, direction), round by round
 GATE_FACTORS = ((1.0, 1.0), (1 / 2, 2 / 3), (1 / 2, 2 / 3))
@@ -54,11 +42,6 @@ GATE_FACTORS = ((1.0, 1.0), (1 / 2, 2 / 3), (1 / 2, 2 / 3))
 MAX_NOISE_ROUNDS, NOISE_GROWTH = 4, 1.1
 #: a mount of one of several robots is corrected if it is off by so many of its sigmas
 MOUNT_SIGMAS = 4.0
-#: rounds of loop closing, at most
-MAX_CLOSING_ROUNDS = 8
-#: solutions from inflated to stated covariances of closures, at most; residuals that stay above
-#: this share of those of the solution before make no progress
-MAX_TIGHTENING_ROUNDS, NO_PROGRESS = 4, 0.9
 
 
 def reoptimise_scan_log(
@@ -95,13 +78,46 @@ def reoptimise_scan_log(
     solve = Solver(config)
     steps, estimate = _with_observed_motion_noise(recompute_motions(steps, tracks), estimate, solve)
     counts: Counter[str] = Counter()
-    noise = LogNoise()
     closures: list[Closure] = []
     if config.backend.close_loops:
-        steps, closures, estimate = _close_loops(
+        steps, closures, estimate = close_loops(
             steps, estimate, keyframe_scans, landmarks, solve, tamper, counts, config
         )
-    association = config.association
+    steps, estimate = _with_merged_landmarks(
+        steps, estimate, closures, landmarks, solve, counts, config.association
+    )
+    if closures:
+        # those stay that the landmarks do not satisfy without them
+        estimate = solve(steps, estimate)
+        missed = violated(closures, estimate.states, ALREADY_CLOSED)
+        closures = [c for c, off in zip(closures, missed, strict=True) if off]
+        counts["closures_kept"] = len(closures)
+    if robots is not None:
+        steps = robots.associated_again(steps, estimate, config.robust, config)
+    if config.odometry.calibrate:
+        estimate = solve(steps, estimate, closures)
+        closed = with_closures(steps, closures)
+        estimate, steps, noise = _calibrated(closed, estimate, tracks, config, frames)
+    else:
+        estimate = solve(steps, estimate, closures, rough=False, joint=True)
+        steps, noise = with_closures(steps, closures), LogNoise()
+    landmarks.update_from(steps, estimate)
+    return estimate, steps, counts, noise
+
+
+def _with_merged_landmarks(
+    steps: tuple[Step, ...],
+    estimate: Estimate,
+    closures: Sequence[Closure],
+    landmarks: LandmarkMap,
+    solve: Solver,
+    counts: Counter[str],
+    association: AssociationConfig,
+) -> tuple[tuple[Step, ...], Estimate]:
+    """Steps in which landmarks that are one are merged and each observation is of the best one.
+
+    Round after round, by narrower gates; arguments as of `reoptimise_scan_log`.
+    """
     for factor_m, factor_rad in GATE_FACTORS:
         steps, estimate = split_composites(steps, estimate, landmarks)
         estimate = solve(steps, estimate, closures)
@@ -124,61 +140,59 @@ def reoptimise_scan_log(
             steps = again.steps
         counts["observations_reassociated"] += again.moved
         counts["observations_dropped"] += again.dropped
-    if closures:
-        # those stay that the landmarks do not satisfy without them
-        estimate = solve(steps, estimate)
-        missed = violated(closures, estimate.states, ALREADY_CLOSED)
-        closures = [c for c, off in zip(closures, missed, strict=True) if off]
-        counts["closures_kept"] = len(closures)
-    if robots is not None:
-        steps = robots.associated_again(steps, estimate, config.robust, config)
-    if config.odometry.calibrate:
-        estimate = solve(steps, estimate, closures)
-        closed = with_closures(steps, closures)
+    return steps, estimate
 
-        def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
-            made = recompute_motions(closed, tracks, estimate)
-            return scale_motion_noise(made, noise_scales(made, estimate))
 
-        solved: list[CalibratedSolution] = []  # the last one
+def _calibrated(
+    closed: tuple[Step, ...],
+    estimate: Estimate,
+    tracks: Mapping[str, Track],
+    config: Config,
+    frames: Mapping[str, str] | None,
+) -> tuple[Estimate, tuple[Step, ...], LogNoise]:
+    """The final solution, with the calibrations as unknowns and the noise that the log shows.
 
-        def keep(solution: CalibratedSolution, _made: Sequence[Step]) -> None:
-            solved[:] = [solution]
+    Args:
+        closed: steps that hold their closures.
+        estimate: of their states and landmarks.
+        tracks: get their calibrations, and the covariances of these.
+        config: settings.
+        frames: see `reoptimise_scan_log`.
+    """
 
-        estimate, _ = calibrate(
-            rebuild,
-            estimate,
-            tracks,
-            config.robust,
-            1,
-            rough=len(tracks) == 1,
-            solved_once=keep,
-        )
-        noise = fit_motion_noise(tracks, [solved[0].graph.posterior()])
-        if len(tracks) > 1:
-            # the world lies where the mount of the first robot puts it: a mount that this drive
-            # does not tell would move the others away from where they started
-            for track in tracks.values():
-                track.hold_mount_unless(MOUNT_SIGMAS)
-            closed = with_sensor_starts(closed, tracks, frames)
-        rounds = ROUNDS - (len(tracks) == 1)
-        estimate, steps = calibrate(
-            rebuild,
-            estimate,
-            tracks,
-            config.robust,
-            rounds,
-            joint=True,
-            solved_once=keep,
-            bias_m=config.front_end.floor_normal_m,
-        )
-        noise = replace(noise, lines=solved[0].graph.line_noise)
-        add_mount_bias(estimate, tracks)
-    else:
-        estimate = solve(steps, estimate, closures, rough=False, joint=True)
-        steps = with_closures(steps, closures)
-    landmarks.update_from(steps, estimate)
-    return estimate, steps, counts, noise
+    def rebuild(estimate: Estimate, _last: bool) -> tuple[Step, ...]:
+        made = recompute_motions(closed, tracks, estimate)
+        return scale_motion_noise(made, noise_scales(made, estimate))
+
+    solved: list[CalibratedSolution] = []  # the last one
+
+    def keep(solution: CalibratedSolution, _made: Sequence[Step]) -> None:
+        solved[:] = [solution]
+
+    alone = len(tracks) == 1
+    estimate, _ = calibrate(
+        rebuild, estimate, tracks, config.robust, 1, rough=alone, solved_once=keep
+    )
+    noise = fit_motion_noise(tracks, [solved[0].graph.posterior()])
+    if not alone:
+        # the world lies where the mount of the first robot puts it: a mount that this drive
+        # does not tell would move the others away from where they started
+        for track in tracks.values():
+            track.hold_mount_unless(MOUNT_SIGMAS)
+        closed = with_sensor_starts(closed, tracks, frames)
+    estimate, steps = calibrate(
+        rebuild,
+        estimate,
+        tracks,
+        config.robust,
+        ROUNDS - alone,
+        joint=True,
+        solved_once=keep,
+        bias_m=config.front_end.floor_normal_m,
+    )
+    noise = replace(noise, lines=solved[0].graph.line_noise)
+    add_mount_bias(estimate, tracks)
+    return estimate, steps, noise
 
 
 def add_mount_bias(estimate: Estimate, tracks: Mapping[str, Track]) -> None:
@@ -231,109 +245,6 @@ def with_sensor_starts(
         else step
         for step in steps
     )
-
-
-class Solver:
-    """Solves steps with closures; ``backend`` is the latest one, for its covariances."""
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._solved: tuple[Sequence[Step], Estimate] | None = None
-
-    def __call__(
-        self,
-        steps: Sequence[Step],
-        start: Estimate,
-        closures: Sequence[Closure] = (),
-        *,
-        rough: bool = True,
-        joint: bool = False,
-    ) -> Estimate:
-        """The estimate; the graph stays as long as steps are the same and go on from the last."""
-        if self._solved is None or self._solved[0] is not steps or self._solved[1] is not start:
-            self.backend = Reoptimiser(self._config, steps, start)
-        estimate = self.backend.solve(closures, rough=rough, joint=joint)
-        self._solved = steps, estimate
-        return estimate
-
-
-def _close_loops(
-    steps: tuple[Step, ...],
-    estimate: Estimate,
-    keyframe_scans: Iterable[KeyframeScan],
-    landmarks: LandmarkMap,
-    solve: Solver,
-    tamper: Tamper | None,
-    counts: Counter[str],
-    config: Config,
-) -> tuple[tuple[Step, ...], list[Closure], Estimate]:
-    """Loops closed by matching submaps.
-
-    Where landmarks of different visits are associated wrongly, the estimate is wrong and
-    overconfident. So closures are judged by what is known without those associations, and
-    landmarks of different visits are associated again afterwards.
-
-    Returns:
-        Steps, the closures that are used, and the estimate with them.
-    """
-    split = split_by_visit(steps, estimate.states, landmarks, config.loop_closure.revisit_path_m)
-    closed = split.start(estimate)
-    prior = solve(split.steps, closed)
-    submaps = build_submaps(prior.states, keyframe_scans, config)  # bent by no wrong association
-    accepted: dict[Pair, Closure] = {}
-    correcting: set[Pair] = set()  # those of them that correct the estimate
-    refused: dict[Pair, Closure] = {}
-    examined: dict[Pair, Array] = {}
-    with PairVerifier(submaps) as verify:
-        for _ in range(MAX_CLOSING_ROUNDS if submaps else 0):
-            P = solve.backend.state_covariance([submap.state for submap in submaps])
-            new, confirming = loop_closures(
-                with_poses_from(submaps, closed.states), P, examined, config.loop_closure, verify
-            )
-            if tamper is not None:
-                new = [c for c in tamper([*new, *confirming], submaps) if c not in confirming]
-            # what was inconsistent before may be consistent now
-            proposed = refused | {c.pair: c for c in new}
-            consistent = consistent_closures(
-                [*proposed.values(), *confirming], with_poses_from(submaps, prior.states), P
-            )
-            refused = {pair: c for pair, c in proposed.items() if c not in consistent}
-            added = {c.pair for c in consistent if c not in confirming}
-            if not added:
-                break
-            correcting |= added
-            accepted |= {c.pair: c for c in consistent}
-            closed = prior = _tightened(split.steps, [*accepted.values()], closed, solve)
-            off = violated([*accepted.values()], closed.states, MAX_RESIDUAL)
-            taken_back = {pair for pair, is_off in zip(accepted, off, strict=True) if is_off}
-            counts["closures_refused"] += len(taken_back & correcting)
-            accepted = {pair: c for pair, c in accepted.items() if pair not in taken_back}
-            correcting -= taken_back
-    counts["closures_verified"] = len(correcting)
-    counts["closures_refused"] += len(refused)
-    if not correcting:
-        return steps, [], estimate
-    closures = [closure for pair, closure in accepted.items() if pair in correcting]
-    return rejoin_visits(split, closed, landmarks, config.association), closures, closed
-
-
-def _tightened(
-    steps: Sequence[Step], closures: Sequence[Closure], estimate: Estimate, solve: Solver
-) -> Estimate:
-    """Solved with closures whose covariances are inflated first, and tightened step by step."""
-    before = np.inf
-    for _ in range(MAX_TIGHTENING_ROUNDS):
-        if not any(violated(closures, estimate.states, MAX_RESIDUAL)):
-            return solve(steps, estimate, closures)
-        estimate = solve(steps, estimate, inflate_covariances(closures, estimate.states))
-        left = float(np.abs(residuals(closures, estimate.states)).sum())
-        if left > NO_PROGRESS * before:
-            break
-        before = left
-    # what holds the estimate back may be wrong associations: starting where all closures are
-    # satisfied, the robust kernels tell which of the two is wrong
-    held = solve(steps, estimate, [replace(closure, verified=True) for closure in closures])
-    return solve(steps, held, closures)
 
 
 def _with_observed_motion_noise(
