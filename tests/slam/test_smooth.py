@@ -573,7 +573,8 @@ def test_sightings_beside_scans_enter_at_their_own_time():
 
 
 @pytest.mark.parametrize(
-    ("log", "module"), [("lab", "batch_optimisation"), ("two-robots", "final_result")]
+    ("log", "module"),
+    [("lab", "scan_smoothing.batch_optimisation"), ("two-robots", "slam.final_result")],
 )
 def test_walls_end_where_they_were_seen_also_if_the_minimum_has_turned_the_map(
     log, module, monkeypatch
@@ -581,7 +582,7 @@ def test_walls_end_where_they_were_seen_also_if_the_minimum_has_turned_the_map(
     """One robot, solved as a batch, and two. The prior of a start is so weak that a large map turns
     by some mrad on the last step: ends of walls then lay metres along the walls from where they
     were seen. They come from the robots' poses through each observation, to 1e-6 m."""
-    where = importlib.import_module(f"graphslam.slam.{module}")
+    where = importlib.import_module(f"graphslam.{module}")
     minimum = where.settled
     world = np.array([3.0, -1.0, 0.4])
 
