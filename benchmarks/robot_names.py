@@ -31,6 +31,7 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.evaluation.metrics import evaluate
 from graphslam.logs import open_logs, read_true_associations, read_truth
+from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.results.folder import load, save
 from graphslam.simulation import Scenario, load_scenario, simulate
 from graphslam.slam.final_result import make_result
@@ -70,12 +71,9 @@ def solved(log: Path, config: Config) -> FinishedPass:
     """A log solved as `smooth` does it; the pass has the sightings behind the associations."""
     opened = open_logs([log], config)
     known = initialise(opened, config)
-
-    def nothing(_count: int) -> None:
-        pass
-
-    found = run_sighting_passes(opened, config, known, nothing)
-    return found or run_passes(opened, config, known, nothing, None)
+    job = SmoothingJob(opened, config)
+    found = run_sighting_passes(job, known)
+    return found or run_passes(job, known)
 
 
 def fates(log: Path, finished: FinishedPass) -> Counter[str]:

@@ -13,12 +13,11 @@ from graphslam.core.errors import LogError
 from graphslam.core.stages import announce
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
-from graphslam.mapping.loop_closure import Tamper
 from graphslam.multi_robot.frame_tree import FrameAssignment
-from graphslam.pipeline.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.pipeline.findings import Findings, FinishedPass
-from graphslam.pipeline.log_pass import PriorKnowledge, Progress, timed
+from graphslam.pipeline.log_pass import PriorKnowledge, timed
 from graphslam.pipeline.recorded_closures import RecordedClosures
+from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.pipeline.start_priors import origin
 from graphslam.scan_smoothing.batch_optimisation import optimise_scan_log
 from graphslam.scan_smoothing.localisation import place_path
@@ -78,19 +77,14 @@ class SessionLog(TrackedLog):
         self.last_ns = max(self.last_ns, one.last_ns)
 
 
-def solve_session_log(
-    log: LogSet,
-    config: Config,
-    progress: Progress,
-    tamper: Tamper | None,
-    kept: Checkpoint = NOTHING_KEPT,
-) -> FinishedPass:
+def solve_session_log(job: SmoothingJob) -> FinishedPass:
     """Sessions of one place as one batch.
 
     Raises:
         LogError: no message of the logs could be used.
         EstimationError: the estimate is indeterminate, or a start that is told is malformed.
     """
+    log, config = job.log, job.config
     announce("sessions")
     sessions: dict[str, ScanLog] = {}
     first = messages = 0
@@ -99,9 +93,10 @@ def solve_session_log(
         before = messages
 
         def count(read: int, before: int = before) -> None:
-            progress(before + read)
+            job.progress(before + read)
 
-        one = track_scan_log(log.of_robot(robot), config, alone, count, None, kept, first)
+        own = replace(job, log=log.of_robot(robot), progress=count)
+        one = track_scan_log(own, alone, first=first)
         messages += one.counts["messages"]
         if one.steps:
             sessions[robot] = one
@@ -110,10 +105,10 @@ def solve_session_log(
         raise LogError(f"{log.files[0].path}: nothing in it could be used; see `graphslam info`")
     took = {"joining": 0.0}
     with timed(took, "joining"):
-        starts = kept.stage("starts", lambda: join_sessions(log, sessions, config))
+        starts = job.kept.stage("starts", lambda: join_sessions(log, sessions, config))
     known = PriorKnowledge(starts, NO_RECORDED)
     joined = SessionLog(log, config, known, sessions)
     joined.seconds.update(took)
     with timed(joined.seconds, "final optimisation"):
-        estimate = optimise_scan_log(joined, tamper)
+        estimate = optimise_scan_log(joined, job.tamper)
     return FinishedPass(joined, estimate, Findings({}, {}, {}), is_settled=True)

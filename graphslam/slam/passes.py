@@ -14,14 +14,13 @@ from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import ClockEstimate, estimate_clocks
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.logs import LogSet
-from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.robot_candidates import NOT_THERE
 from graphslam.mapping.robot_gating import RobotOffers
 from graphslam.multi_robot.identity_swaps import find_swapped_identities
-from graphslam.pipeline.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.pipeline.findings import Findings, FinishedPass
 from graphslam.pipeline.log_pass import LogPass, PriorKnowledge, Progress, timed
 from graphslam.pipeline.pipeline import Pipeline
+from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.scan_smoothing.causal import causal_of
 from graphslam.scan_smoothing.reoptimise_scans import reoptimise_scan_log
 from graphslam.sighting_smoothing.unnamed_sightings import solve_unnamed
@@ -31,32 +30,24 @@ from graphslam.slam.initialisation import with_identities
 MAX_CLOCK_PASSES = 1
 
 
-def run_passes(
-    log: LogSet,
-    config: Config,
-    known: PriorKnowledge,
-    progress: Progress,
-    tamper: Tamper | None,
-    kept: Checkpoint = NOTHING_KEPT,
-) -> FinishedPass:
+def run_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass:
     """Read the log until nothing more is found that would change how it is read.
 
     Args:
-        log: opened logs.
-        config: settings.
+        job: what is to be solved.
         known: what is known before the first pass.
-        progress: see `graphslam.slam.smooth.smooth`.
-        tamper: see `graphslam.mapping.loop_closure.Tamper`.
-        kept: stages.
 
     Raises:
         LogError: no message of the log could be used.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
+    log, config = job.log, job.config
     clock_passes = 0
     while True:
-        pipeline = Pipeline(log, config, known, tamper)
-        estimate, is_rough = kept.read_pass(pipeline, partial(estimate_of_pass, pipeline, progress))
+        pipeline = Pipeline(log, config, known, job.tamper)
+        estimate, is_rough = job.kept.read_pass(
+            pipeline, partial(estimate_of_pass, pipeline, job.progress)
+        )
         with timed(pipeline.seconds, "final optimisation"):
             finding = Future(partial(pass_findings, pipeline, estimate))
             # a log is seldom read again, so where reoptimisation is quick it does not wait to know

@@ -33,7 +33,7 @@ from graphslam.logs import LogSet
 from graphslam.odometry.given_increments import consecutive_motions
 from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.findings import Findings, FinishedPass
-from graphslam.pipeline.log_pass import PriorKnowledge, Progress, counted, timed
+from graphslam.pipeline.log_pass import PriorKnowledge, counted, timed
 from graphslam.pipeline.pipeline import Pipeline
 from graphslam.pipeline.recorded_closures import (
     accept_closures,
@@ -42,6 +42,7 @@ from graphslam.pipeline.recorded_closures import (
 )
 from graphslam.pipeline.robot_settings import make_tracks
 from graphslam.pipeline.robot_state import RobotState
+from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.pipeline.start_priors import start_poses
 from graphslam.slam.initialisation import estimate_start_poses
 from graphslam.slam.passes import pass_findings
@@ -58,23 +59,19 @@ def is_pose_graph(log: LogSet, config: Config) -> bool:
     return at_once and kinds == {OdometryIncrement, RelativePose}
 
 
-def solve_pose_graph(log: LogSet, config: Config, progress: Progress) -> FinishedPass:
+def solve_pose_graph(job: SmoothingJob) -> FinishedPass:
     """Solve a log of relative poses.
-
-    Args:
-        log: opened logs.
-        config: settings.
-        progress: see `graphslam.slam.smooth.smooth`.
 
     Raises:
         LogError: no message of the log could be used.
         EstimationError: the estimate is indeterminate, or a given start pose is malformed.
     """
+    log, config = job.log, job.config
     seconds: dict[str, float] = defaultdict(float)
     counts: Counter[str] = Counter()
     with timed(seconds, "read"):
         tracks = make_tracks(log, config)
-        read = counted(log.messages(TRUE_RECORDS, prefetch=True), counts, progress)
+        read = counted(log.messages(TRUE_RECORDS, prefetch=True), counts, job.progress)
         messages = take_relative_poses(read, tracks)
     with timed(seconds, "starts"):
         starts = start_poses(log, config)

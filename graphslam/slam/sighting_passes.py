@@ -4,16 +4,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
-from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import clocks_from_paths
 from graphslam.estimation.settled import settled
-from graphslam.logs import LogSet
-from graphslam.pipeline.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.pipeline.findings import Findings, FinishedPass
-from graphslam.pipeline.log_pass import PriorKnowledge, Progress, timed
+from graphslam.pipeline.log_pass import PriorKnowledge, timed
 from graphslam.pipeline.robot_state import Causal
+from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.sighting_smoothing.causal_sightings import CausalReplay, replay_causally
 from graphslam.sighting_smoothing.rough_solution import is_misfit
 from graphslam.sighting_smoothing.sighting_pass import SightingPass, can_solve_at_once
@@ -27,21 +25,16 @@ from graphslam.slam.initialisation import with_identities
 from graphslam.slam.passes import decide_next_pass, find_clocks, find_swapped_names
 
 
-def run_sighting_passes(
-    log: LogSet,
-    config: Config,
-    known: PriorKnowledge,
-    progress: Progress,
-    kept: Checkpoint = NOTHING_KEPT,
-) -> FinishedPass | None:
+def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass | None:
     """`run_passes` without an incremental estimate; None for logs that need one.
 
-    The causal trajectories are estimated in the second process; ``kept``: stages.
+    The causal trajectories are estimated in the second process.
 
     Raises:
         LogError: no message of the log could be used.
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
+    log, config = job.log, job.config
     settings = config.backend
     whole = settings.name == "batch" and settings.reoptimise and settings.optimise_at_end
     if not (whole and can_solve_at_once(log, config)):
@@ -49,7 +42,7 @@ def run_sighting_passes(
     clock_passes = 0
     while True:
         one = SightingPass(log, config, known)
-        kept.read_pass(one, partial(one.run, progress))
+        job.kept.read_pass(one, partial(one.run, job.progress))
         if not one.all_named:
             return None
         if not one.steps:

@@ -15,6 +15,7 @@ from graphslam.pipeline.findings import FinishedPass
 from graphslam.pipeline.log_kind import is_scan_log, is_session_log
 from graphslam.pipeline.log_pass import Progress
 from graphslam.pipeline.robot_settings import check_robots
+from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.scan_smoothing.log_reader import Reading
 from graphslam.scan_smoothing.scan_log import solve_scan_log
 from graphslam.scan_smoothing.session_log import solve_session_log
@@ -58,36 +59,28 @@ def smooth(
             "known_map.directory: only scans of one robot, by back end batch and without --causal, "
             "are localised in a known map"
         )
-    solve = partial(_solved, log, config, progress, tamper, ahead, kept, began, known_map)
-    result = kept.stage("result", solve)
+    job = SmoothingJob(log, config, progress, tamper, kept)
+    result = kept.stage("result", partial(_solved, job, known_map, ahead, began))
     summary = {**result.summary, "resumed": kept.resumed}
     return replace(result, summary=summary)
 
 
 def _solved(
-    log: LogSet,
-    config: Config,
-    progress: Progress,
-    tamper: Tamper | None,
-    ahead: Reading | None,
-    kept: Checkpoint,
-    began: float,
-    known_map: KnownMap | None,
+    job: SmoothingJob, known_map: KnownMap | None, ahead: Reading | None, began: float
 ) -> Result:
     """The result by the way that is for logs of this kind; arguments as of `smooth`."""
+    log, config = job.log, job.config
     if is_pose_graph(log, config):
-        return make_result(solve_pose_graph(log, config, progress), began)
+        return make_result(solve_pose_graph(job), began)
     if is_session_log(log, config):
-        return make_result(solve_session_log(log, config, progress, tamper, kept), began)
-    known = kept.stage("starts", lambda: initialise(log, config))
+        return make_result(solve_session_log(job), began)
+    known = job.kept.stage("starts", lambda: initialise(log, config))
     known = replace(known, known_map=known_map)
     initialised = time.perf_counter()
     if is_scan_log(log, config):
-        finished: FinishedPass | None = solve_scan_log(
-            log, config, known, progress, tamper, ahead, kept
-        )
+        finished: FinishedPass | None = solve_scan_log(job, known, ahead)
     else:
-        finished = run_sighting_passes(log, config, known, progress, kept)
-    finished = finished or run_passes(log, config, known, progress, tamper, kept)
+        finished = run_sighting_passes(job, known)
+    finished = finished or run_passes(job, known)
     finished.pipeline.seconds["starts"] = initialised - began
     return make_result(finished, began)

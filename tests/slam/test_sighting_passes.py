@@ -10,6 +10,7 @@ from graphslam.core import worker
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import wrap
 from graphslam.logs import open_logs
+from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.sighting_smoothing import state_per_step
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.sighting_passes import run_sighting_passes
@@ -122,7 +123,7 @@ def test_a_sighting_without_identity_needs_an_estimate(log):
     config = load_config(overrides=["backend.name=batch", "association.identities=ignore", *STARTS])
     opened = open_logs([log], config)
     known = initialise(opened, config)
-    assert run_sighting_passes(opened, config, known, lambda _count: None) is None
+    assert run_sighting_passes(SmoothingJob(opened, config), known) is None
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a second process")
