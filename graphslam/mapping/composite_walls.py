@@ -72,13 +72,13 @@ def split_composites(
 
 def parts_of(wall: WallObservations, bias_m: float) -> list[WallObservations]:
     """The parts of a wall; itself if it is one."""
-    aside = part_aside(wall, bias_m)
+    aside = find_offset_part(wall, bias_m)
     if aside is None:
         return [wall]
     return [*parts_of(wall.only(~aside), bias_m), *parts_of(wall.only(aside), bias_m)]
 
 
-def part_aside(wall: WallObservations, bias_m: float) -> BoolArray | None:
+def find_offset_part(wall: WallObservations, bias_m: float) -> BoolArray | None:
     """Which observations (n,) show a part that stands aside from the others; None without one.
 
     A part at an end is looked for first, then one with the others on both sides. ``bias_m``: sigma,

@@ -39,7 +39,7 @@ from graphslam.mapping.robot_candidates import (
     robot_associations,
     robot_distances,
 )
-from graphslam.mapping.wall_parts import parts_aside
+from graphslam.mapping.wall_parts import conflicting_observations
 from graphslam.odometry.preintegration import Track
 
 #: images between two refreshes of all landmark estimates; those compared are always current
@@ -297,7 +297,7 @@ class Associator:
         taken = np.array([int(i) in chosen for i in pairs.observation], dtype=bool)
         chosen |= best(free & ~in_graph & ~taken)
         matched = {n: int(pairs.landmark[k]) for n, k in chosen.items()}
-        for n in parts_aside(matched, image.seen):
+        for n in conflicting_observations(matched, image.seen):
             del chosen[n]
         chosen |= {int(pairs.observation[k]): int(k) for k in np.flatnonzero(known)}
         return chosen, robots

@@ -17,7 +17,7 @@ MIN_INFORMATION = 0.1
 Span = tuple[int, int]
 
 
-def untied_closures(
+def closures_not_in_landmarks(
     closures: Sequence[Closure],
     spans: Mapping[State, Span],
     steps: Iterable[Step],

@@ -18,7 +18,7 @@ from graphslam.core.records import Observation
 APART_M, APART_SIGMAS = 0.04, 4.0
 
 
-def parts_aside(targets: Mapping[int, int], seen: Sequence[Observation]) -> set[int]:
+def conflicting_observations(targets: Mapping[int, int], seen: Sequence[Observation]) -> set[int]:
     """Observations that are left out for others of the same wall in the same image.
 
     Those that fit each other and have the most length together stay.

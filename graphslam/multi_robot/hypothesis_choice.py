@@ -17,7 +17,12 @@ from graphslam.core.geometry import between
 from graphslam.core.record import replace
 from graphslam.mapping.submaps import SubmapPose
 from graphslam.multi_robot.map_localisation import Support, self_contradictions
-from graphslam.multi_robot.place_recognition import EQUIVALENT_SHARE, MIN_MATCHES, alike, extent
+from graphslam.multi_robot.place_recognition import (
+    EQUIVALENT_SHARE,
+    MIN_MATCHES,
+    extent,
+    why_too_small,
+)
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 
 #: contradicted places for each confirmed one, and how many, from which there is a doubt: of 24 days
@@ -106,7 +111,9 @@ def choose(
     if count < MIN_MATCHES:
         return Refusal(f"only {count} of {len(places)} places are recognised", Telling.FEW)
     wide_m = extent([p for p, is_seen in zip(places, one.confirmed, strict=True) if is_seen])
-    near = f"the places that are recognised extend over {wide_m:.1f} m only, {alike(wide_m)}"
+    near = (
+        f"the places that are recognised extend over {wide_m:.1f} m only, {why_too_small(wide_m)}"
+    )
     if wide_m < min(config.min_place_extent_m, SEEN_SHARE * seen_m):
         return Refusal(near, Telling.NEAR)
     others = [x for x in found if differ(one, x)]

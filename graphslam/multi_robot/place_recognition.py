@@ -201,7 +201,7 @@ def choose_alignment(
     if min(extents) < config.min_place_extent_m:
         return (
             f"the places that {a} and {b} have in common extend over {min(extents):.1f} m only, "
-            f"{alike(min(extents))}"
+            f"{why_too_small(min(extents))}"
         )
     # a match with a clearly lower score at its place does not speak for another alignment
     best_score = {found[k].index_b: scores[k] for k in best}
@@ -346,7 +346,7 @@ def consensus(starts: Array, covs: Array, members: IntArray) -> Consensus:
     return Consensus(pose, fit.cov, d2)
 
 
-def alike(extent_m: float) -> str:
+def why_too_small(extent_m: float) -> str:
     """Why places that extend over so little, m, are not enough, and what accepts them."""
     accepted = max(np.floor(20.0 * extent_m) / 20.0 - 0.05, 0.0)
     return f"and rooms look alike (--set multi_robot.min_place_extent_m={accepted:.3g} accepts it)"

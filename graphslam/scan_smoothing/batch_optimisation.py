@@ -45,7 +45,7 @@ from graphslam.mapping.loop_closure import Tamper, fix_position
 from graphslam.mapping.loose_returns import with_loose_returns
 from graphslam.mapping.moved_walls import part_moved
 from graphslam.mapping.reassociation import reassociate
-from graphslam.mapping.redundant_closures import untied_closures
+from graphslam.mapping.redundant_closures import closures_not_in_landmarks
 from graphslam.mapping.visits import tie_visits
 from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.log_pass import timed
@@ -212,7 +212,7 @@ def _solved(
     counts["landmarks_moved"] = len(scan_log.moved)
     steps, found = split_composites(steps, found, landmarks)
     # once landmarks of different visits are tied, most closures are no longer needed
-    closures = untied_closures(closures, paths.spans, steps, landmarks)
+    closures = closures_not_in_landmarks(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
     parked = find_parked(scan_log)
     landmarks.update_from(steps, found)

@@ -86,10 +86,12 @@ def start_as_given(
         EstimationError: from there the log sees something else than the map.
     """
     given = given_start(scan_log, robot)
-    laid = laid_into(scan_log, robot, given, known_map, tamper)
+    laid = close_path_in_map(scan_log, robot, given, known_map, tamper)
     is_wrong = is_contradicted(given, laid, robot)
     if is_wrong:  # pulled to what was told, the beginning of the path is torn
-        laid = laid_into(scan_log, robot, laid_start(laid, robot), known_map, tamper)
+        laid = close_path_in_map(
+            scan_log, robot, start_of_closed_path(laid, robot), known_map, tamper
+        )
     placed, places = check_given(scan_log, robot, laid, known_map)
     said = doubt(placed, places, scan_log.config.loop_closure)
     if is_wrong:
@@ -100,7 +102,7 @@ def start_as_given(
     if not placed.confirmed.any():
         said = "no place of it is recognised; the log is where its start was told to be"
     scan_log.map_doubt = said
-    return (laid_start(laid, robot) if placed.confirmed.any() else given), laid
+    return (start_of_closed_path(laid, robot) if placed.confirmed.any() else given), laid
 
 
 def is_contradicted(given: Start, laid: ClosedPaths, robot: str) -> bool:
@@ -150,9 +152,9 @@ def found_start(
     own = own_places(scan_log, robot)
     found, supports = [], []
     for start in possible_starts(scan_log, robot, known_map, own):
-        laid = laid_into(scan_log, robot, start, known_map, tamper)
+        laid = close_path_in_map(scan_log, robot, start, known_map, tamper)
         supports.append(support(known_map.places, with_poses_from(own.places, laid.states)))
-        found.append((laid_start(laid, robot), laid))
+        found.append((start_of_closed_path(laid, robot), laid))
     why = "no place in it is recognised"
     if supports:
         seen_m = seen_extent(known_map.places, own.places)
@@ -188,7 +190,7 @@ def possible_starts(
     ]
 
 
-def laid_into(
+def close_path_in_map(
     scan_log: ScanLog,
     robot: str,
     start: Start,
@@ -205,7 +207,7 @@ def laid_into(
         scan_log.paths[robot].poses, scan_log.steps[0] = before, first
 
 
-def laid_start(laid: ClosedPaths, robot: str) -> Start:
+def start_of_closed_path(laid: ClosedPaths, robot: str) -> Start:
     """Where a log begins whose whole path was ``laid`` into a map.
 
     The path as laid was compared with the map, so its loops must not be looked for far from there:

@@ -177,7 +177,8 @@ def close_paths(
     for name, states in tracked.items():
         at = anchors[name]
         moved[name] = replace(
-            states, poses=follow(states.poses, at, graph.poses[first : first + len(at)])
+            states,
+            poses=move_between_anchors(states.poses, at, graph.poses[first : first + len(at)]),
         )
         times[name], firsts[name] = states.stamps_ns[at], first
         first += len(at)
@@ -201,7 +202,7 @@ def neighbourhoods(submaps: Sequence[SubmapPose]) -> dict[State, Span]:
     return found
 
 
-def follow(poses: Array, anchors: Array, at: Array) -> Array:
+def move_between_anchors(poses: Array, anchors: Array, at: Array) -> Array:
     """A path (n, 3) after its poses ``anchors`` (k,), the first and last included, moved to ``at``.
 
     In between, the disagreement is spread over the path in proportion to its length.

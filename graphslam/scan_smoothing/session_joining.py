@@ -40,10 +40,10 @@ from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.pipeline.start_priors import origin, start_poses
 from graphslam.scan_smoothing.localisation import (
-    laid_into,
-    laid_start,
+    close_path_in_map,
     own_places,
     possible_starts,
+    start_of_closed_path,
 )
 from graphslam.scan_smoothing.scan_tracking import ScanLog
 
@@ -212,9 +212,9 @@ class _Group:
             key = name, np.concatenate([start.pose, start.cov.ravel()]).tobytes()
             if key not in self._laid:
                 session = sessions[name]
-                laid = laid_into(session.log, name, start, self.map)
+                laid = close_path_in_map(session.log, name, start, self.map)
                 own = with_poses_from(session.own.places, laid.states)
-                self._laid[key] = laid_start(laid, name), own
+                self._laid[key] = start_of_closed_path(laid, name), own
             found[name], own = self._laid[key]
             places += own
         return _Laid(found, places, support(self.map.places, places))

@@ -159,7 +159,7 @@ def close_loops(
             )
             if not ledger.decide(proposed, confirming, consistent):
                 break
-            closed = prior = tightened(split.steps, ledger.used, closed, solve)
+            closed = prior = solve_with_tightening(split.steps, ledger.used, closed, solve)
             ledger.take_back(violated(ledger.used, closed.states, MAX_RESIDUAL))
     correcting = ledger.having(State.CORRECTING)
     counts["closures_verified"] = len(correcting)
@@ -169,7 +169,7 @@ def close_loops(
     return rejoin_visits(split, closed, landmarks, config.association), correcting, closed
 
 
-def tightened(
+def solve_with_tightening(
     steps: Sequence[Step], closures: Sequence[Closure], estimate: Estimate, solve: Solver
 ) -> Estimate:
     """Solved with closures whose covariances are inflated first, and tightened step by step."""

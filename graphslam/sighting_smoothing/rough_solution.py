@@ -162,9 +162,11 @@ def with_landmarks(
 def _solved(problem: RoughProblem, states: Mapping[str, Trajectory], known: Landmarks) -> Estimate:
     """A rough estimate from initial ``states``, and landmarks where they are ``known``."""
     start, made = with_landmarks(problem, states, known)
-    return calibrate_roughly(made, start, problem.tracks, wide(problem.config.robust), ROUNDS)
+    return calibrate_roughly(
+        made, start, problem.tracks, widened_kernel(problem.config.robust), ROUNDS
+    )
 
 
-def wide(kernel: RobustConfig) -> RobustConfig:
+def widened_kernel(kernel: RobustConfig) -> RobustConfig:
     """The kernel of the rough solution."""
     return replace(kernel, scale=WIDE * kernel.scale)

@@ -28,7 +28,7 @@ from graphslam.sighting_smoothing.rough_solution import (
     RoughProblem,
     solve_rough_problem,
     states_by_odometry,
-    wide,
+    widened_kernel,
     with_landmarks,
 )
 from graphslam.sighting_smoothing.sighting_noise import estimate_noise
@@ -53,7 +53,7 @@ def solve_roughly(one: SightingPass) -> tuple[Estimate, tuple[Step, ...]]:
         states = _initial_states(one)
         with _held(one.tracks):
             start, made = with_landmarks(problem, states, {})
-        kernel = wide(one.config.robust)
+        kernel = widened_kernel(one.config.robust)
         return calibrate(lambda *_: made, start, one.tracks, kernel, 1, rough=True)
     for track in one.tracks.values():
         track.calibration = track.prior
@@ -130,7 +130,7 @@ def with_gated_robots(one: SightingPass, rough: Estimate, made: tuple[Step, ...]
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    recorded, groups, kernel = one.steps, one.groups, wide(one.config.robust)
+    recorded, groups, kernel = one.steps, one.groups, widened_kernel(one.config.robust)
     kept = every = _sources(recorded)
     used = made
 

@@ -8,7 +8,7 @@ from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import between, compose, log, rotate_cov
 from graphslam.estimation import factors
 from graphslam.mapping.submap_graph import SubmapConstraints, SubmapGraph
-from graphslam.scan_smoothing.path_closing import LandmarkUncertainty, follow
+from graphslam.scan_smoothing.path_closing import LandmarkUncertainty, move_between_anchors
 
 START = 1e-8 * np.eye(3)[None]
 COV = np.diag([0.05, 0.03, 0.02]) ** 2
@@ -166,9 +166,11 @@ def test_a_path_follows_its_anchors_and_keeps_its_shape_between_them():
     path, anchors = np.array(path), np.array([0, 7, 15, 20])
     world = np.array([1.0, -2.0, 0.7])
     rigid = compose(world, path)
-    np.testing.assert_allclose(follow(path, anchors, rigid[anchors]), rigid, atol=1e-9)
+    np.testing.assert_allclose(
+        move_between_anchors(path, anchors, rigid[anchors]), rigid, atol=1e-9
+    )
     bent = rigid[anchors] + rng.normal(0, 0.05, (4, 3))
-    np.testing.assert_allclose(follow(path, anchors, bent)[anchors], bent, atol=1e-9)
+    np.testing.assert_allclose(move_between_anchors(path, anchors, bent)[anchors], bent, atol=1e-9)
 
 
 def test_a_path_whose_start_is_uncertain_is_placed_by_its_closures():

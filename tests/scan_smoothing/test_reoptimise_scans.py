@@ -18,7 +18,7 @@ from graphslam.scan_smoothing.reoptimise_scans import (
     with_sensor_starts,
 )
 from graphslam.scan_smoothing.solver import Solver
-from graphslam.scan_smoothing.submap_closing import tightened
+from graphslam.scan_smoothing.submap_closing import solve_with_tightening
 from graphslam.simulation import load_scenario, simulate
 
 SECOND = 10**9
@@ -76,7 +76,7 @@ def test_true_closures_undo_what_is_wrong_and_sure_of_itself(turn_rad):
     solve, estimate = solved(steps)
     told = closures(true)
     assert all(violated(told, estimate.states, BORNE_OUT))
-    estimate = tightened(steps, told, estimate, solve)
+    estimate = solve_with_tightening(steps, told, estimate, solve)
     assert not any(violated(told, estimate.states, BORNE_OUT))
 
 
@@ -86,7 +86,7 @@ def test_a_false_closure_moves_nothing():
     true, steps = corridor(0.0)
     solve, estimate = solved(steps)
     told = closures(true, off=(0.0, 1.0, 0.1))
-    estimate = tightened(steps, told, estimate, solve)
+    estimate = solve_with_tightening(steps, told, estimate, solve)
     assert violated(told, estimate.states, BORNE_OUT) == [False, False, False, True]
     # 0.2: a fifth of how far off it is
     assert np.abs(residuals(told, estimate.states)[-1, 1]) == pytest.approx(1.0, abs=0.2)
