@@ -30,8 +30,8 @@ from graphslam.change_detection.thesis_method import (
 )
 from graphslam.core.config import ChangesConfig, Config
 from graphslam.core.geometry import Array, transform
+from graphslam.importers.formats import IMPORTERS
 from graphslam.logs import open_logs
-from graphslam.logs.importers import IMPORTERS
 from graphslam.results.folder import load, save
 from graphslam.slam.smooth import smooth
 

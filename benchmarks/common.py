@@ -23,7 +23,8 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.records import Result
-from graphslam.logs import open_logs, pose_stamp_ns
+from graphslam.importers import pose_stamp_ns
+from graphslam.logs import open_logs
 from graphslam.simulation import load_scenario, simulate
 from graphslam.slam.smooth import smooth
 

@@ -27,7 +27,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 MEMORY_MB, LIMIT_S, LONGEST_BYTES = 2000, 60, 200_000
 #: packages whose branches are looked at
-LOOKED_AT = ["graphslam.logs", "graphslam.core", "mcap"]
+LOOKED_AT = ["graphslam.logs", "graphslam.importers", "graphslam.core", "mcap"]
 
 
 def fuzz(name: str, folder: Path, seconds: int) -> None:
@@ -38,8 +38,10 @@ def fuzz(name: str, folder: Path, seconds: int) -> None:
     with atheris.instrument_imports(include=LOOKED_AT):
         import importlib
 
-        for path in sorted((ROOT / "graphslam/logs").glob("*.py")):
-            importlib.import_module(f"graphslam.logs.{path.stem}".removesuffix(".__init__"))
+        for package in ("logs", "importers"):
+            for path in sorted((ROOT / "graphslam" / package).glob("*.py")):
+                name = f"graphslam.{package}.{path.stem}".removesuffix(".__init__")
+                importlib.import_module(name)
         import hostile_bytes
     target = hostile_bytes.TARGETS[name]
     warnings.simplefilter("error")  # a warning of Python is no message for people

@@ -45,7 +45,7 @@ from graphslam.core.records import Message, Scan, Trajectory
 from graphslam.core.worker import allow_fork
 from graphslam.evaluation.relation_metrics import read_relations
 from graphslam.evaluation.trajectory_metrics import align
-from graphslam.logs import IMPORTERS
+from graphslam.importers import IMPORTERS
 from graphslam.results.folder import SavedRobot
 
 #: how much faster than it was recorded

@@ -21,8 +21,8 @@ import numpy as np
 from common import DATA, parser, pose_graph_values, smooth_log
 
 from graphslam.core.records import Result
-from graphslam.logs import IMPORTERS, pose_stamp_ns
-from graphslam.logs.import_pose_graph import PoseGraphEdge, read_pose_graph, split_odometry
+from graphslam.importers import IMPORTERS, pose_stamp_ns
+from graphslam.importers.import_pose_graph import PoseGraphEdge, read_pose_graph, split_odometry
 
 PRIOR_SIGMA = 1e-3
 #: the graph without false closures; one robot with them; two robots with them, and without

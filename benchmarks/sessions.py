@@ -28,7 +28,8 @@ from mcap.reader import make_reader
 import graphslam
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import read_relations
-from graphslam.logs import IMPORTERS, LogWriter, read_truth, schemas
+from graphslam.importers import IMPORTERS
+from graphslam.logs import LogWriter, read_truth, schemas
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Leg, Scenario, Wall
 

@@ -35,7 +35,8 @@ from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import read_relations
 from graphslam.evaluation.trajectory_metrics import align, pair_poses
-from graphslam.logs import IMPORTERS, GroundTruth, LogSet, open_logs
+from graphslam.importers import IMPORTERS
+from graphslam.logs import GroundTruth, LogSet, open_logs
 from graphslam.slam.smooth import smooth
 
 #: name of a row -> preset, settings

@@ -18,7 +18,7 @@ from common import parser, smooth_log
 
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import GraphSlamError, OutputError
-from graphslam.logs import IMPORTERS, pose_stamp_ns
+from graphslam.importers import IMPORTERS, pose_stamp_ns
 from graphslam.results.folder import load, save
 
 SOURCE = gtsam.findExampleDataFile("victoria_park.txt")

@@ -23,7 +23,7 @@ from common import parser, pose_graph_values, smooth_log
 from speed_logs import grid_pose_graph
 
 from graphslam.core.geometry import Array, between, compose, exp, log, rotate_cov, wrap
-from graphslam.logs import IMPORTERS
+from graphslam.importers import IMPORTERS
 
 #: m: radius of the ring
 RING_M = 12.0

@@ -23,7 +23,8 @@ from graphslam.core.config_io import load_config
 from graphslam.core.errors import GraphSlamError
 from graphslam.core.record_codec import read, write
 from graphslam.core.records import Trajectory
-from graphslam.logs import IMPORTERS, open_logs
+from graphslam.importers import IMPORTERS
+from graphslam.logs import open_logs
 from graphslam.pipeline.checkpoint import kinds
 
 ROOT = Path(__file__).parents[1]
@@ -198,7 +199,7 @@ def _import(form: str, name: str, data: bytes, folder: Path) -> None:
 def _rawlogs() -> Iterator[bytes]:
     """Not packed: damage of the packing would hide all other; the last as MRPT wrote it."""
     for form in ("pairs", "observations"):
-        packed = (ROOT / f"tests/logs/rawlog/{form}.rawlog").read_bytes()
+        packed = (ROOT / f"tests/importers/rawlog/{form}.rawlog").read_bytes()
         yield gzip.decompress(packed)[:8000]
     yield packed
 

@@ -22,6 +22,7 @@ ROOT = Path(graphslam.__file__).parent
 PACKAGES = (
     "core",
     "logs",
+    "importers",
     "simulation",
     "perception",
     "odometry",
@@ -40,8 +41,8 @@ PACKAGES = (
     "campaigns",
     "cli",
 )
-#: most pairs of packages of which one imports the other
-MOST_ARROWS = 100
+#: of all pairs of packages, the most of which one imports the other; fifteen larger packages had 0.63
+MOST_ARROWS = 0.55
 #: most lines of a module: what is longer has more than one responsibility
 MOST_LINES = 450
 
@@ -148,8 +149,9 @@ def test_only_the_command_line_uses_the_public_interface():
 def test_few_packages_know_each_other():
     """Prints how many pairs of packages import each other: what someone has to keep in mind."""
     arrows = {(here, there) for _, _, here, there in package_imports() if here in PACKAGES}
-    print(f"{len(arrows)} import arrows between packages")
-    assert len(arrows) <= MOST_ARROWS
+    pairs = len(PACKAGES) * (len(PACKAGES) - 1) // 2
+    print(f"{len(arrows)} import arrows between {pairs} pairs of packages")
+    assert len(arrows) <= MOST_ARROWS * pairs
 
 
 def test_the_architecture_page_prints_this_order():

@@ -73,7 +73,11 @@ def test_every_schema_that_is_read_names_its_test():
     """Each row of the table schema, encoding, container in docs/logs.md: tests that there are."""
     text = (ROOT / "docs/logs.md").read_text(encoding="utf-8")
     table = text.split("| tested in |\n")[1].split("\n\n")[0].splitlines()[1:]
-    tests = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "tests/logs").glob("test_*.py"))
+    files = [
+        *(ROOT / "tests/logs").glob("test_*.py"),
+        *(ROOT / "tests/importers").glob("test_*.py"),
+    ]
+    tests = "".join(path.read_text(encoding="utf-8") for path in files)
     assert table
     for row in table:
         named = re.findall(r"`(test_\w+)`", row.split(" | ")[-1])

@@ -22,7 +22,7 @@ from doc_pages import PAGES, command_lines
 from paths import ROOT
 from room_log import START_NS, S, drive, true_pose
 
-from graphslam.logs import IMPORTERS
+from graphslam.importers import IMPORTERS
 from graphslam.simulation import load_scenario, simulate
 
 SECONDS = 12

@@ -12,7 +12,7 @@ import typer
 from graphslam.core.config import BackendConfig, FrontEndConfig
 from graphslam.core.presets import PRESETS
 from graphslam.core.suggestions import did_you_mean
-from graphslam.logs import IMPORTERS
+from graphslam.importers import IMPORTERS
 from graphslam.simulation import SCENARIOS
 
 if TYPE_CHECKING:

@@ -59,7 +59,7 @@ from graphslam.cli.stage_bar import stage_bar
 from graphslam.core.config import Config
 from graphslam.core.config_io import load_config, named_backend
 from graphslam.core.errors import ConfigError, OutputError
-from graphslam.logs import IMPORTERS
+from graphslam.importers import IMPORTERS
 
 
 @command("info")

@@ -15,7 +15,8 @@ from rich.text import Text
 
 from graphslam.core.geometry import area_centroid
 from graphslam.core.records import Result
-from graphslam.logs import ImportSummary, LogInfo, RobotInfo, TopicInfo
+from graphslam.importers import ImportSummary
+from graphslam.logs import LogInfo, RobotInfo, TopicInfo
 from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
 from graphslam.results.report_comparison import (
     FILTER_WIN_HEADS,

@@ -1,4 +1,4 @@
-"""Logs in and out: recordings to time-ordered records, other formats to MCAP.
+"""Logs in and out: recordings to time-ordered records, and MCAP written.
 
 No other package imports `mcap` or `rosbags`. See docs/logs.md.
 """
@@ -10,9 +10,6 @@ from graphslam.core.lazy_exports import lazy_exports
 if TYPE_CHECKING:
     from graphslam.logs.containers import is_recording
     from graphslam.logs.findings import Finding
-    from graphslam.logs.import_pose_graph import pose_stamp_ns
-    from graphslam.logs.import_summary import ImportSummary
-    from graphslam.logs.importers import IMPORTERS
     from graphslam.logs.log_info import LogInfo, inspect_logs
     from graphslam.logs.log_set import LogFile, LogSet, open_logs
     from graphslam.logs.topic_info import RobotInfo, TopicInfo
@@ -28,9 +25,6 @@ if TYPE_CHECKING:
 _NAMES = {
     "containers": ("is_recording",),
     "findings": ("Finding",),
-    "import_pose_graph": ("pose_stamp_ns",),
-    "import_summary": ("ImportSummary",),
-    "importers": ("IMPORTERS",),
     "log_info": ("LogInfo", "inspect_logs"),
     "log_set": ("LogFile", "LogSet", "open_logs"),
     "topic_info": ("RobotInfo", "TopicInfo"),
@@ -39,10 +33,8 @@ _NAMES = {
 }
 
 __all__ = [
-    "IMPORTERS",
     "Finding",
     "GroundTruth",
-    "ImportSummary",
     "LogFile",
     "LogInfo",
     "LogSet",
@@ -52,7 +44,6 @@ __all__ = [
     "inspect_logs",
     "is_recording",
     "open_logs",
-    "pose_stamp_ns",
     "read_true_associations",
     "read_truth",
     "truth_from_recordings",

@@ -9,8 +9,8 @@ from paths import real_data
 from graphslam.change_detection import detect_changes, load_visit
 from graphslam.change_detection.visit import on_surface
 from graphslam.core.config import ChangesConfig, Config
+from graphslam.importers.formats import IMPORTERS
 from graphslam.logs import open_logs
-from graphslam.logs.importers import IMPORTERS
 from graphslam.results.folder import load, save
 from graphslam.simulation.raycast import BeamFan, cast_beams
 from graphslam.simulation.world import Outline, make_world

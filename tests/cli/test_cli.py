@@ -20,7 +20,8 @@ from room_log import MOUNT, SCAN, SCANS, START_NS, S, drive, true_pose
 from graphslam.cli import main, terminal
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose
-from graphslam.logs import IMPORTERS, LogWriter
+from graphslam.importers import IMPORTERS
+from graphslam.logs import LogWriter
 from graphslam.results.file_formats import read_trajectory
 from graphslam.results.folder import load
 from graphslam.slam import smooth as smooth_module

@@ -22,7 +22,8 @@ from room_log import SECONDS, drive
 import graphslam
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
-from graphslam.logs import IMPORTERS, is_recording, open_logs
+from graphslam.importers import IMPORTERS
+from graphslam.logs import is_recording, open_logs
 from graphslam.logs.containers import CONTAINERS, open_recording
 from graphslam.logs.recording import RawMessage, Recording, raw_messages
 

@@ -17,11 +17,11 @@ from mcap.writer import Writer
 from graphslam.core.config import Config, LimitsConfig, LogsConfig
 from graphslam.core.errors import GraphSlamError, LogError, OutputError
 from graphslam.core.output_folder import atomic_folder
+from graphslam.importers.formats import IMPORTERS
+from graphslam.importers.import_csv import import_csv
 from graphslam.logs import LogWriter, open_logs
 from graphslam.logs.containers import open_recording
 from graphslam.logs.decoders import TopicContext, decode_messages
-from graphslam.logs.import_csv import import_csv
-from graphslam.logs.importers import IMPORTERS
 from graphslam.logs.recording import raw_messages
 from graphslam.pipeline.robot_state import times_of_readings
 from tests import mutations

@@ -10,7 +10,8 @@ from common import pose_graph_values
 from graphslam.core.config import BackendConfig, Config, StartConfig
 from graphslam.core.geometry import between, compose
 from graphslam.estimation.closure_graph import ClosureGraph
-from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
+from graphslam.importers import IMPORTERS, pose_stamp_ns
+from graphslam.logs import open_logs
 from graphslam.mapping import recorded_closure_verification
 from graphslam.mapping.recorded_closure_verification import CONTRADICTED
 from graphslam.slam.smooth import smooth

@@ -13,7 +13,8 @@ from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import between, compose, wrap
 from graphslam.core.records import Trajectory
 from graphslam.evaluation.metrics import evaluate
-from graphslam.logs import IMPORTERS, LogWriter, open_logs, read_truth
+from graphslam.importers import IMPORTERS
+from graphslam.logs import LogWriter, open_logs, read_truth
 from graphslam.pipeline.start_priors import first_truth
 from graphslam.results.folder import load, save
 from graphslam.slam.smooth import smooth

@@ -13,7 +13,8 @@ from graphslam.core.config import RobustConfig
 from graphslam.core.config_io import load_config
 from graphslam.core.records import Association, Closure, Estimate, Start, Step, Trajectory
 from graphslam.estimation.g2o import graph_error, graph_g2o
-from graphslam.logs import IMPORTERS, open_logs
+from graphslam.importers import IMPORTERS
+from graphslam.logs import open_logs
 from graphslam.results.folder import save
 from graphslam.slam.smooth import smooth
 

@@ -17,7 +17,8 @@ from graphslam.core.records import Trajectory
 from graphslam.estimation.isam2 import Isam2Backend
 from graphslam.estimation.replay import replay
 from graphslam.evaluation.relation_metrics import read_relations, relation_metrics
-from graphslam.logs import IMPORTERS, open_logs
+from graphslam.importers import IMPORTERS
+from graphslam.logs import open_logs
 from graphslam.results.folder import save
 from graphslam.slam.smooth import smooth
 

@@ -13,7 +13,8 @@ from graphslam.core.records import Motion, Start, Step
 from graphslam.estimation import factors
 from graphslam.estimation.initial_estimate import initial_estimate
 from graphslam.estimation.isam2 import Reoptimiser
-from graphslam.logs import IMPORTERS, LogWriter, open_logs
+from graphslam.importers import IMPORTERS
+from graphslam.logs import LogWriter, open_logs
 from graphslam.odometry.given_increments import consecutive_motions
 from graphslam.pipeline.recorded_closures import take_relative_poses
 from graphslam.pipeline.robot_settings import make_tracks

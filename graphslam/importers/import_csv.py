@@ -24,11 +24,19 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from graphslam.core.errors import LogError
-from graphslam.logs import csv_units
-from graphslam.logs.csv_columns import MOUNT, POSES, SCANS, TUM_POSES, Columns, Kind, columns_of
-from graphslam.logs.csv_tables import Table, read_table
-from graphslam.logs.import_carmen import finite, parse_stamp_ns
-from graphslam.logs.import_summary import ImportSummary
+from graphslam.importers import csv_units
+from graphslam.importers.csv_columns import (
+    MOUNT,
+    POSES,
+    SCANS,
+    TUM_POSES,
+    Columns,
+    Kind,
+    columns_of,
+)
+from graphslam.importers.csv_tables import Table, read_table
+from graphslam.importers.import_carmen import finite, parse_stamp_ns
+from graphslam.importers.import_summary import ImportSummary
 from graphslam.logs.physical_limits import MAX_RANGE_M
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_files

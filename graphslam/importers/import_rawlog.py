@@ -15,11 +15,18 @@ import numpy as np
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, compose
+from graphslam.importers.import_summary import ImportSummary
+from graphslam.importers.mrpt_objects import SkippedObjects
+from graphslam.importers.mrpt_rawlog import (
+    Item,
+    LaserScan,
+    RawlogMotion,
+    Reading,
+    TurnRate,
+    read_rawlog,
+)
 from graphslam.logs import schemas
 from graphslam.logs.cdr_writing import imu_bytes, tf_bytes
-from graphslam.logs.import_summary import ImportSummary
-from graphslam.logs.mrpt_objects import SkippedObjects
-from graphslam.logs.mrpt_rawlog import Item, LaserScan, RawlogMotion, Reading, TurnRate, read_rawlog
 from graphslam.logs.physical_limits import MAX_RANGE_M
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import MOST_BYTES

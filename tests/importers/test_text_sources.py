@@ -6,7 +6,7 @@ import gzip
 import pytest
 
 from graphslam.core.errors import LogError
-from graphslam.logs import IMPORTERS
+from graphslam.importers import IMPORTERS
 
 SCAN = "FLASER 3 1.25 2.5 81.83 0 0 0 0 0 0 {0} host 0.2\n"
 ODOMETRY = "ODOM {0} 0 0 0 0 0 {0} host 0.1\n"

@@ -22,7 +22,8 @@ from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import between, compose
-from graphslam.logs import IMPORTERS, LogWriter, open_logs, schemas
+from graphslam.importers import IMPORTERS
+from graphslam.logs import LogWriter, open_logs, schemas
 from graphslam.logs.cdr_writing import imu_bytes
 
 HERE = Path(__file__).parent / "rawlog"
@@ -333,7 +334,7 @@ def test_a_wrong_check_sum_is_said(tmp_path):
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_one_line_and_overwrites_nothing(data, why, tmp_path, monkeypatch):
-    monkeypatch.setattr("graphslam.logs.mrpt_objects._FARTHEST", 1 << 20)
+    monkeypatch.setattr("graphslam.importers.mrpt_objects._FARTHEST", 1 << 20)
     source, target = tmp_path / "a.rawlog", tmp_path / "log.mcap"
     source.write_bytes(data)
     target.write_bytes(b"mine")

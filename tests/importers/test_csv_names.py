@@ -8,7 +8,8 @@ import pytest
 
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
-from graphslam.logs import IMPORTERS, open_logs, read_truth
+from graphslam.importers import IMPORTERS
+from graphslam.logs import open_logs, read_truth
 
 #: stamp s, x m, y m, heading rad
 POSES = np.column_stack(

@@ -19,8 +19,8 @@ import numpy as np
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, compose, exp
-from graphslam.logs.import_carmen import parse_stamp_ns
-from graphslam.logs.import_summary import ImportSummary
+from graphslam.importers.import_carmen import parse_stamp_ns
+from graphslam.importers.import_summary import ImportSummary
 from graphslam.logs.source_files import first_and_all, text_files
 from graphslam.logs.writer import Event, LogWriter
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, adjoint, inverse, is_positive, rotate_cov, wrap
-from graphslam.logs.import_summary import ImportSummary
+from graphslam.importers.import_summary import ImportSummary
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import text_lines
 from graphslam.logs.writer import LogWriter

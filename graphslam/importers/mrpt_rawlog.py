@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array
-from graphslam.logs.mrpt_objects import ObjectReader, SkippedObjects, UnreadableError
+from graphslam.importers.mrpt_objects import ObjectReader, SkippedObjects, UnreadableError
 from graphslam.logs.physical_limits import MAX_POSITION_M
 from graphslam.logs.source_files import unreadable
 

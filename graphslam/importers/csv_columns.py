@@ -12,7 +12,7 @@ from itertools import product
 from typing import Literal, NamedTuple
 
 from graphslam.core.errors import LogError
-from graphslam.logs.csv_tables import Names
+from graphslam.importers.csv_tables import Names
 
 #: poses with a stamp, a pose of a laser on the robot, scans
 Kind = Literal["poses", "mount", "scans"]

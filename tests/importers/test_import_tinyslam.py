@@ -7,7 +7,8 @@ from paths import real_data
 from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
-from graphslam.logs import IMPORTERS, open_logs
+from graphslam.importers import IMPORTERS
+from graphslam.logs import open_logs
 
 
 def line(time_us, left, right, ranges):

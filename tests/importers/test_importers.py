@@ -17,9 +17,10 @@ from graphslam.core import geometry, records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import rotation3
-from graphslam.logs import IMPORTERS, open_logs, pose_stamp_ns
-from graphslam.logs.import_carmen import parse_stamp_ns
-from graphslam.logs.import_pose_graph import PoseGraphEdge, reverse_edge
+from graphslam.importers import IMPORTERS, pose_stamp_ns
+from graphslam.importers.import_carmen import parse_stamp_ns
+from graphslam.importers.import_pose_graph import PoseGraphEdge, reverse_edge
+from graphslam.logs import open_logs
 
 
 def example(name: str) -> Path:

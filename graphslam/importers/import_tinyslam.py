@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from graphslam.core.geometry import Array
-from graphslam.logs.import_summary import ImportSummary
+from graphslam.importers.import_summary import ImportSummary
 from graphslam.logs.schemas import DEFAULT_ROBOT
 from graphslam.logs.source_files import first_and_all, text_lines
 from graphslam.logs.writer import LogWriter

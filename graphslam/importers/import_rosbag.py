@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from graphslam.core.errors import LogError
+from graphslam.importers.import_summary import ImportSummary
 from graphslam.logs.containers import open_recording
-from graphslam.logs.import_summary import ImportSummary
 from graphslam.logs.recording import raw_messages
 from graphslam.logs.schemas import KNOWN
 from graphslam.logs.writer import LogWriter

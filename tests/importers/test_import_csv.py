@@ -11,7 +11,8 @@ import graphslam
 from graphslam.core import records
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
-from graphslam.logs import IMPORTERS, open_logs, read_truth
+from graphslam.importers import IMPORTERS
+from graphslam.logs import open_logs, read_truth
 
 
 def seconds(ns: int) -> str:

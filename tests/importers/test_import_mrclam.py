@@ -11,8 +11,9 @@ from graphslam.core import records
 from graphslam.core.config import Config, OdometryConfig
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import compose, exp
-from graphslam.logs import IMPORTERS, open_logs, read_truth
-from graphslam.logs.import_mrclam import COMMANDED, MAX_ARC_NS
+from graphslam.importers import IMPORTERS
+from graphslam.importers.import_mrclam import COMMANDED, MAX_ARC_NS
+from graphslam.logs import open_logs, read_truth
 from graphslam.pipeline.robot_settings import odometry_settings
 
 START = 1248444187

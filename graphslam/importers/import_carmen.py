@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import between, wrap
-from graphslam.logs.import_summary import ImportSummary
+from graphslam.importers.import_summary import ImportSummary
 from graphslam.logs.no_return import find_no_return
 from graphslam.logs.physical_limits import MAX_RANGE_M
 from graphslam.logs.schemas import DEFAULT_ROBOT
