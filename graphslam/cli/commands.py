@@ -166,10 +166,14 @@ def smooth(
         graphslam.make_map(output)
     if viewer:
         graphslam.write_viewer(output, viewer)
-    from graphslam.cli import show  # after the work, which begins the sooner
+
+    def shown() -> None:
+        from graphslam.cli import show  # after the work, which begins the sooner; not with --json
+
+        show.smoothed(result, output)
 
     code = 3 if strict and result.summary["verdict"]["verdict"] != "good" else 0
-    return Output(result.summary, lambda: show.smoothed(result, output), code=code)
+    return Output(result.summary, shown, code=code)
 
 
 @command("map")

@@ -6,25 +6,25 @@ is estimated jointly, and its uncertainty is in every covariance.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
-from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
-from graphslam.core.motion_models import HELD_SIGMA, MOUNT_NAMES, Calibration
+from graphslam.core.geometry import Array, rotation3
+from graphslam.core.motion_models import HELD_SIGMA, MOUNT_NAMES, Calibration, Increments
 from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Motion, Step
+from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
 from graphslam.estimation.joint_covariances import information_root, solve_root
 from graphslam.estimation.line_noise import fit_line_noise
 from graphslam.estimation.line_residuals import LineResiduals
+from graphslam.estimation.motion_arrays import increments_of, linear_motions, moved_by
 from graphslam.estimation.optimisation import (
     CONVERGED_ERROR_ROUGH,
     marginals_of,
@@ -86,16 +86,21 @@ def at_calibration(
     found: Mapping[str, Calibration],
 ) -> tuple[Step, ...]:
     """Steps whose motions, computed with ``now``, are as the solution has them with ``found``."""
-    change = {robot: found[robot].mean - now[robot].mean for robot in found}
-    made = []
-    for step in steps:
-        motions = dict(step.motions)
-        for robot, motion in step.motions.items():
-            if robot in change and change[robot].any():
-                delta = motion.delta + motion.d_delta_d_calibration @ change[robot]
-                motions[robot] = replace(motion, delta=np.append(delta[:2], wrap(delta[2])))
-        made.append(replace(step, motions=motions))
-    return tuple(made)
+    moved = {
+        robot: iter(moved_by(made, found[robot].mean - now[robot].mean).delta)
+        for robot, made in increments_of(steps).items()
+        if robot in found and (found[robot].mean != now[robot].mean).any()
+    }
+    return tuple(
+        replace(
+            step,
+            motions={
+                robot: replace(motion, delta=next(moved[robot])) if robot in moved else motion
+                for robot, motion in step.motions.items()
+            },
+        )
+        for step in steps
+    )
 
 
 class CalibrationGraph:
@@ -128,7 +133,9 @@ class CalibrationGraph:
         self._values, self._priors = gtsam.Values(), priors
         self._marginals: gtsam.Marginals | None = None  # at the last solution
         self.line_noise: Mapping[str, Array] = {}
-        self._steps, self._now = steps, now  # the motions in the graph, and their calibration
+        self._steps = steps
+        self._made: Mapping[str, Increments] = increments_of(steps)  # the motions in the graph
+        self._now = now  # by what they were computed
         self._linear_at: gtsam.Values | None = None  # the solution around which they are linear
         self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
         self._free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
@@ -145,7 +152,7 @@ class CalibrationGraph:
         for index, robot, last, key in builder.motions:
             self._motions[robot].append((index, last, key))
         if calibrated:
-            self.calibrate_motions(steps, now)
+            self._linearise(self._made, now)
 
     def calibrate_motions(self, steps: Sequence[Step], now: Mapping[str, Calibration]) -> None:
         """Put motions in the graph that depend on the calibration.
@@ -154,16 +161,22 @@ class CalibrationGraph:
             steps: with motions between the same states, computed with ``now``.
             now: robot -> calibration, around which motions are linear.
         """
+        self._steps = steps
+        self._linearise(increments_of(steps), now)
+
+    def _linearise(self, made: Mapping[str, Increments], now: Mapping[str, Calibration]) -> None:
+        """Put motions in the graph that are ``made`` with calibrations ``now``, see above."""
         graph, values = self._builder.graph, self._values
         unit = gtsam.noiseModel.Unit.Create(3)
-        self._steps, self._now, self._linear_at = steps, now, values
+        self._made, self._now, self._linear_at = made, now, values
         for robot, use in self._free.items():
             if not len(use):
                 continue
             values.update(self._keys[robot], now[robot].mean[use])
-            motions = [step.motions[robot] for step in steps if robot in step.motions]
-            poses = [factors.read(values, key, 3) for key in self._builder.state_keys(robot)]
-            linear = _linear_motions(motions, np.array(poses), use)
+            if robot not in made:
+                continue
+            keys = np.array(self._builder.state_keys(robot), dtype=np.int64)
+            linear = linear_motions(made[robot], self._builder.poses_at(values, keys), use)
             for (index, last, key), (A_x, R, A_c, b) in zip(
                 self._motions[robot], linear, strict=True
             ):
@@ -273,7 +286,13 @@ class CalibrationGraph:
         if self._linear_at is self._values:
             return
         found = self._calibrations({})
-        self.calibrate_motions(at_calibration(self._steps, self._now, found), found)
+        made = {
+            robot: moved_by(motions, found[robot].mean - self._now[robot].mean)
+            if robot in found
+            else motions
+            for robot, motions in self._made.items()
+        }
+        self._linearise(made, found)
 
     def _mount_places(self) -> dict[str, tuple[int, list[int]]]:
         """Robots whose mounts are estimated, see `information_root`."""
@@ -321,7 +340,7 @@ class CalibrationGraph:
             blocks = marginals_of(builder.graph, self._values, pairs)
         except RuntimeError as error:
             raise builder.explain(error) from error
-        return Posterior(self._steps, builder, self._values, blocks, free)
+        return Posterior(self._steps, self._made, builder, self._values, blocks, free)
 
     def weigh_lines(self) -> None:
         """Give lines the noise that their residuals in the last solution show, from now on.
@@ -419,23 +438,3 @@ class CalibratedSolution:
         cov = np.zeros((3 + len(own), 3 + len(own)))
         cov[3:, 3:] = own
         return JointMarginal.of(means, len(landmarks), cov)
-
-
-def _linear_motions(
-    motions: Sequence[Motion], poses: Array, use: IntArray
-) -> Iterator[tuple[Array, Array, Array, Array]]:
-    """Motions of a robot as A_x x + R y + A_c c = b around ``poses`` (n + 1, 3): A_x, R, A_c, b.
-
-    Error log(delta(c)⁻¹ x⁻¹ y) along the axes of the measured end, whitened; ``use`` (p,) are the
-    indices of the parameters that are not held.
-    """
-    if not motions:
-        return iter(())
-    delta = np.array([m.delta for m in motions])
-    cov = np.array([m.cov for m in motions])
-    D = np.array([m.d_delta_d_calibration[:, use] for m in motions])
-    back = rotation3(-delta[:, 2])
-    R = np.linalg.cholesky(np.linalg.inv(back @ cov @ back.mT)).mT
-    h = between(poses[: len(motions)], poses[1 : len(motions) + 1])
-    b = -(R @ log(between(delta, h))[:, :, None])[:, :, 0]
-    return zip(R @ -adjoint(inverse(h)), R, R @ (-back @ D), b, strict=True)

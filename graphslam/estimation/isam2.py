@@ -393,7 +393,14 @@ def with_means(
     values: gtsam.Values, dims: Mapping[int, int], covs: Mapping[int, Array]
 ) -> dict[int, tuple[Array, Array]]:
     """Mean (d,) and covariance (d, d), NaN if missing in ``covs``, of every variable."""
+    unknown = {dim: np.full((dim, dim), np.nan) for dim in (2, 3)}
+    # one call for all poses: in the order of their keys
+    poses = sorted(key for key, dim in dims.items() if dim == 3)
+    means = dict(zip(poses, gtsam.utilities.extractPose2(values).copy("C"), strict=True))
     return {
-        key: (factors.read(values, key, dim), covs.get(key, np.full((dim, dim), np.nan)))
+        key: (
+            means[key] if dim == 3 else factors.read(values, key, dim),
+            covs.get(key, unknown[dim]),
+        )
         for key, dim in dims.items()
     }

@@ -41,10 +41,9 @@ MIN_SIGMA = 1e-4
 UNDERSTATED = 2.0
 #: median of the absolute value of a standard normal variable
 MEDIAN_OF_NORMAL = 0.6745
-#: of the sigma of a variance: smaller changes of it do not matter
-NEGLIGIBLE = 0.5
-#: what of a `Motion` is one of `Increments`
-_INCREMENT = ("delta", "cov", "d_delta_d_calibration")
+#: of the sigma of a variance: smaller changes of it do not matter. Each is about half of the one
+#: before, so that all to come are about as large as the last
+NEGLIGIBLE = 0.75
 
 
 def noise_scales(
@@ -140,18 +139,17 @@ def fit_track_noise(
         None if there are too few motions.
     """
     own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
-    times, solved = _solved(own)
+    times = _times(own)
     by_odometry = np.array([not motion.from_scans for motion in own], dtype=bool)
     by_odometry &= ~track.is_uncovered(*times)
     if by_odometry.sum() < FEW_MOTIONS:
         return None
-    found = posterior.motions(robot, solved)
+    found = posterior.motions(robot, posterior.made[robot])
     used = times[0][by_odometry], times[1][by_odometry]
     variances, normalised, left = (
         of[by_odometry] for of in (found.variance, found.normalised, found.redundancy)
     )
-    track.config = fit_noise(track, used, variances, normalised, left, relax=relax)
-    after = motion_variances(track, track.config, used)
+    track.config, after = fit_noise(track, used, variances, normalised, left, relax=relax)
     change = np.abs(np.mean(after / variances, axis=0) - 1.0)
     log_sigma = variance_sigma(left)
     change[change < NEGLIGIBLE * log_sigma] = 0.0
@@ -210,10 +208,10 @@ def measured_motion_noise(track: Track, robot: str, posterior: Posterior) -> Arr
     own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
     if len(own) < MIN_MOTIONS:
         return None
-    (begin, end), solved = _solved(own)
+    begin, end = _times(own)
     of = spans(np.append(begin[0], end))
     over = begin[of[:, 0]], end[of[:, 1] - 1]
-    found = posterior.motions(robot, _joined(solved, of), over_spans=True)
+    found = posterior.motions(robot, _joined(posterior.made[robot], of), over_spans=True)
     stated = np.maximum(motion_variances(track, track.config, over), MIN_SIGMA**2)
     return found.variance_factor() * np.median(found.variance / stated, axis=0)
 
@@ -243,14 +241,12 @@ def fit_motion_noise(tracks: Mapping[str, Track], solutions: Iterable[Posterior]
     return LogNoise(odometry=used, measured=measured)
 
 
-def _solved(motions: Sequence[Motion]) -> tuple[tuple[IntArray, IntArray], Increments]:
-    """When motions (n,) begin and end, and these as they were solved, maybe with scaled noise."""
-    times = (
+def _times(motions: Sequence[Motion]) -> tuple[IntArray, IntArray]:
+    """When motions (n,) begin and end."""
+    return (
         np.array([motion.start_ns for motion in motions], dtype=np.int64),
         np.array([motion.end_ns for motion in motions], dtype=np.int64),
     )
-    made = (np.array([getattr(m, name) for m in motions]) for name in _INCREMENT)
-    return times, Increments(*made)
 
 
 def _joined(motions: Increments, ends: IntArray) -> Increments:

@@ -60,12 +60,14 @@ class Residuals:
 class Posterior:
     """A solution: its graph, values and covariances, those of `posterior_pairs` among them.
 
-    ``steps``: what was solved, with motions by the calibration that was found.
+    ``steps``: what was solved. ``made``: robot -> the motions of it, as they were solved, by the
+    calibration that was found.
     ``calibrations``: robot -> key of its calibration, and which of its parameters (p,) that has.
     ``blocks`` are of errors along the axes of each pose.
     """
 
     steps: Sequence[Step]
+    made: Mapping[str, Increments]
     builder: RecordedGraph
     values: gtsam.Values
     blocks: CovarianceBlocks
@@ -132,6 +134,9 @@ class Posterior:
         return np.asarray(np.einsum("nij,njk,nik->ni", H, P, H))
 
     def _values(self, keys: Sequence[int], dim: int) -> Array:
+        """Values (n, dim) of states or of points."""
+        if dim == 3:
+            return self.builder.poses_at(self.values, np.array(keys, dtype=np.int64))
         unique, where = np.unique(np.array(keys, dtype=np.int64), return_inverse=True)
         return np.array([factors.read(self.values, key, dim) for key in unique.tolist()])[where]
 

@@ -100,11 +100,15 @@ class RecordedGraph(BatchGraph):
         """
         polar: dict[Source, list[tuple[int, Association]]] = defaultdict(list)
         motions: list[Motion] = []
+        poses = {robot: path.poses.tolist() for robot, path in start.states.items()}
         for step in steps:
             if step.starts or step.known is not None:
                 self.insert(Step(step.time_ns, step.starts, known=step.known), start, values)
             for robot, motion in step.motions.items():
-                self._insert_state(robot, step.time_ns, start, values)
+                last = self.latest_key(robot, step.time_ns)
+                number = self.states.append(robot, step.time_ns)
+                values.insert(last + 1, gtsam.Pose2(*poses[robot][number]))
+                self._reserve_motion(robot, last)
                 motions.append(motion)
             others = []
             for seen in step.associations:
@@ -123,15 +127,11 @@ class RecordedGraph(BatchGraph):
         for source, observed in sorted(polar.items(), key=lambda one: (one[0][1], one[0][0])):
             self._insert_polar(source, observed, start, values)
 
-    def _insert_state(
-        self, robot: str, time_ns: int, start: Estimate, values: gtsam.Values
-    ) -> None:
-        """Add a robot's next state, and a place in the graph for the motion to it."""
-        last = self.latest_key(robot, time_ns)
-        self.states.append(robot, time_ns)
-        factors.write(values, last + 1, self.value_in(start, last + 1))
-        self.motions.append((self.graph.size(), robot, last, last + 1))
-        self.graph.resize(self.graph.size() + 1)
+    def _reserve_motion(self, robot: str, last: int) -> None:
+        """Take a place in the graph for the motion from a robot's state of this key to the next."""
+        size = self.graph.size()
+        self.motions.append((size, robot, last, last + 1))
+        self.graph.resize(size + 1)
 
     def _make_motions(self, motions: Sequence[Motion], but: Collection[str]) -> None:
         """Fill the places of `motions` of all robots ``but`` some."""
@@ -164,6 +164,15 @@ class RecordedGraph(BatchGraph):
         key = self.state_key(seen.robot, self.states.number(seen.robot, seen.time_ns))
         self.rows += MODELS["line"].rows
         self._lines.append((key, factors.landmark_key(int(seen.target)), seen))
+
+    def poses_at(self, values: gtsam.Values, keys: IntArray) -> Array:
+        """The values (n, 3) of states by their keys (n,); ``values`` are of the whole graph."""
+        # one call for all: in the order of the keys, those of lines first
+        every = np.concatenate(
+            [np.array(self.state_keys(robot), dtype=np.int64) for robot in self.robots]
+        )
+        poses = gtsam.utilities.extractPose2(values)[-len(every) :]
+        return np.ascontiguousarray(poses[np.searchsorted(every, keys)])
 
     @property
     def observes_walls(self) -> bool:

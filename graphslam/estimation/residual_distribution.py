@@ -39,7 +39,8 @@ class ResidualDistribution:
 
 def fit_distribution(normalised: Array) -> ResidualDistribution:
     """The distribution of residuals (n, k), each divided by the sigma that it should have."""
-    fits = [_fit(normalised, nu) for nu in DEGREES_OF_FREEDOM]
+    squared = np.ascontiguousarray(np.square(normalised).T)
+    fits = [_fit(squared, nu) for nu in DEGREES_OF_FREEDOM]
     _, variance, nu = max(fits, key=lambda fit: fit[0])
     k = normalised.shape[1]
     d2 = np.square(normalised / np.sqrt(variance)).sum(axis=1)
@@ -49,18 +50,18 @@ def fit_distribution(normalised: Array) -> ResidualDistribution:
     return ResidualDistribution(variance * factor, math.sqrt(nu / factor))
 
 
-def _fit(normalised: Array, nu: float) -> tuple[float, Array, float]:
-    """Log likelihood, variances (k,) of the scale, and ``nu`` degrees of freedom."""
-    n, k = normalised.shape
-    squared = np.square(normalised)
+def _fit(squared: Array, nu: float) -> tuple[float, Array, float]:
+    """Log likelihood, variances (k,) of the scale, and ``nu`` degrees of freedom.
+
+    ``squared`` (k, n): the residuals, each row contiguous.
+    """
+    k, n = squared.shape
     # a median of squares of normal variables is 0.455
-    variance = np.maximum(np.median(squared, axis=0) / 0.455, 1e-12)
+    variance = np.maximum(np.median(squared, axis=1) / 0.455, 1e-12)
     for _ in range(ROUNDS):
-        d2 = (squared / variance).sum(axis=1)
-        variance = ((nu + k) / (nu + d2) @ squared) / n
-    d2 = (squared / variance).sum(axis=1)
+        variance = squared @ ((nu + k) / (nu + 1.0 / variance @ squared)) / n
     each = math.lgamma((nu + k) / 2) - math.lgamma(nu / 2) - k / 2 * math.log(nu * math.pi)
-    tails = -(nu + k) / 2 * float(np.log1p(d2 / nu).sum())
+    tails = -(nu + k) / 2 * float(np.log1p(1.0 / variance @ squared / nu).sum())
     return n * (each - 0.5 * float(np.log(variance).sum())) + tails, variance, nu
 
 

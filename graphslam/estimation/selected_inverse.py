@@ -71,15 +71,17 @@ def covariance_blocks(
     """
     wanted = set(pairs)
     if wanted:
-        linked = {frozenset(graph.at(n).keys()) for n in range(graph.size())}
-        for pair in sorted(wanted):
-            if frozenset(pair) not in linked:
+        linked = {tuple(graph.at(n).keys()) for n in range(graph.size())}
+        others = sorted(wanted - linked)  # most are in the order of a factor's keys
+        connected = set(map(frozenset, linked)) if others else set()
+        for pair in others:
+            if frozenset(pair) not in connected:
                 graph.add(_empty_factor(*pair[:2]))
     cliques, clique_of = _eliminated(graph, use_qr)
     pairs_in: dict[int, list[tuple[int, ...]]] = defaultdict(list)
     for pair in wanted:
         # of the variables in one factor the first eliminated has the others in its row
-        pairs_in[max(clique_of[key] for key in pair)].append(pair)
+        pairs_in[max(map(clique_of.__getitem__, pair))].append(pair)
     marginals: dict[int, Array] = {}
     joint = _Blocks()
     rows: list[CliqueRows] = []
@@ -90,9 +92,10 @@ def covariance_blocks(
         if keep_rows:
             rows.append(clique.with_block(block))
         for key in clique.own:
-            marginals[key] = cov[clique.rows[key], clique.rows[key]]
+            rows_of = slice(clique.starts[key], clique.starts[key] + clique.sizes[key])
+            marginals[key] = cov[rows_of, rows_of]
         if number in pairs_in:
-            joint.note(cov, clique.rows, pairs_in[number])
+            joint.note(cov, clique, pairs_in[number])
         if above is not None:
             above.release()
     return CovarianceBlocks(marginals, joint.read(), tuple(rows) if keep_rows else None)
@@ -133,14 +136,14 @@ class _Blocks:
         self._covs: list[Array] = []
         self._size = 0
 
-    def note(
-        self, cov: Array, rows: Mapping[int, slice], wanted: Iterable[tuple[int, ...]]
-    ) -> None:
-        """Note which keys are wanted of a covariance (n, n) with the ``rows`` of each."""
+    def note(self, cov: Array, clique: "_Clique", wanted: Iterable[tuple[int, ...]]) -> None:
+        """Note which keys are wanted of the covariance (n, n) of a clique."""
+        start, size = clique.starts.__getitem__, clique.sizes.__getitem__
+        width, first = len(cov), self._size
         for keys in wanted:
-            own = [rows[key] for key in keys]
-            dims = tuple([one.stop - one.start for one in own])
-            self._noted[dims].append((keys, self._size, len(cov), [one.start for one in own]))
+            self._noted[tuple(map(size, keys))].append(
+                (keys, first, width, tuple(map(start, keys)))
+            )
         self._covs.append(cov.ravel())
         self._size += cov.size
         if self._size > NOTED:
@@ -170,39 +173,39 @@ class _Clique:
     """Variables whose rows of the square root end in the same later variables, the separator.
 
     ``conditionals``: their rows, the last eliminated first. ``above``: the clique that has the
-    whole separator; None without separator. ``rows``: key -> its rows in the covariance.
-    ``below``: how many cliques still need the covariance.
+    whole separator; None without separator. ``sizes``: key -> dimension, of all cliques.
+    ``starts``: key -> its first row in the covariance. ``joint_rows``: those of the separator in
+    the covariance above. ``below``: how many cliques still need the covariance.
     """
 
     conditionals: list[gtsam.GaussianConditional]
     own: list[int]
     separator: Sequence[int]
     above: int | None
-    rows: dict[int, slice] = field(default_factory=dict)
+    sizes: dict[int, int]
+    starts: dict[int, int] = field(default_factory=dict)
+    joint_rows: list[int] = field(default_factory=list)
     below: int = 0
     _cov: Array | None = None
-
-    def indices(self, keys: Iterable[int]) -> list[int]:
-        """Rows of variables in the covariance."""
-        rows = self.rows
-        return [row for key in keys for row in range(rows[key].start, rows[key].stop)]
 
     def square_root(self, above: "_Clique | None") -> Array:
         """Rows (n, n + m) of the root of the own variables, and then of the separator."""
         roots = [conditional.R() for conditional in self.conditionals]
-        end = 0
+        starts, sizes, end = self.starts, self.sizes, 0
         for key, root in zip(self.own, roots, strict=True):
-            self.rows[key] = slice(end, end := end + len(root))
+            starts[key], sizes[key] = end, len(root)
+            end += len(root)
         own = end
         if above is not None:
             for key in self.separator:
-                rows = above.rows[key]
-                self.rows[key] = slice(end, end := end + rows.stop - rows.start)
+                starts[key], first, size = end, above.starts[key], sizes[key]
+                self.joint_rows += range(first, first + size)
+                end += size
         return self._square_root(roots, own, end)
 
     def with_block(self, block: Array) -> CliqueRows:
         """What others see of it, with its rows of the root."""
-        own = {key: self.rows[key].stop - self.rows[key].start for key in self.own}
+        own = {key: self.sizes[key] for key in self.own}
         return CliqueRows(own, self.separator, self.above, block)
 
     def invert(self, above: "_Clique | None", block: Array) -> Array:
@@ -215,7 +218,7 @@ class _Clique:
             joint = np.zeros((0, 0))
         else:
             assert above._cov is not None
-            which = np.array(above.indices(self.separator))
+            which = np.array(self.joint_rows)
             joint = above._cov.take(which, axis=0).take(which, axis=1)
         inverse, singular = dtrtri(block[:, :own])
         if singular:
@@ -241,10 +244,13 @@ class _Clique:
             R[:, :own] = roots[0]
             R[:, own:] = self.conditionals[0].S()
             return R
+        starts, sizes = self.starts, self.sizes
         for key, root, conditional in zip(self.own, roots, self.conditionals, strict=True):
-            rows, (_, *others) = self.rows[key], conditional.keys()
+            rows, (_, *others) = slice(starts[key], starts[key] + sizes[key]), conditional.keys()
             R[rows, rows] = root
-            R[rows, self.indices(others)] = conditional.S()
+            R[rows, [row for k in others for row in range(starts[k], starts[k] + sizes[k])]] = (
+                conditional.S()
+            )
         return R
 
     def release(self) -> None:
@@ -261,6 +267,7 @@ def _cliques(net: gtsam.GaussianBayesNet) -> tuple[list[_Clique], dict[int, int]
     number = {own[0]: n for n, own in enumerate(keys)}
     cliques: list[_Clique] = []
     clique_of: dict[int, int] = {}
+    sizes: dict[int, int] = {}
     for n in reversed(range(len(keys))):
         key, *others = keys[n]
         following = min(map(number.__getitem__, others), default=None)
@@ -278,7 +285,7 @@ def _cliques(net: gtsam.GaussianBayesNet) -> tuple[list[_Clique], dict[int, int]
                 continue
             one.below += 1
         clique_of[key] = len(cliques)
-        cliques.append(_Clique([conditionals[n]], [key], others, above))
+        cliques.append(_Clique([conditionals[n]], [key], others, above, sizes))
     for one in cliques:  # in the order of elimination the square root is upper triangular
         one.own.reverse()
         one.conditionals.reverse()

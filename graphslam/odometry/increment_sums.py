@@ -131,8 +131,11 @@ class IncrementSums:
 
 def transformed(covs: Array, T: Array) -> Array:
     """T C Tᵀ of covariances (n, ..., 3, 3), any number of them for each T (n, 3, 3)."""
-    T = T.reshape(len(T), *(1 for _ in covs.shape[1:-2]), 3, 3)
-    return np.asarray(T @ covs @ T.mT)
+    if covs.ndim == T.ndim:
+        return np.asarray(T @ covs @ T.mT)
+    # those of one T side by side: products of so small matrices cost by their number
+    right = (covs.reshape(len(T), -1, 3) @ T.mT).reshape(covs.shape).mT
+    return np.asarray((right.reshape(len(T), -1, 3) @ T.mT).reshape(covs.shape).mT)
 
 
 def _effects(starts: Array, increments: Increments) -> tuple[Array, Array, Array, Array, Array]:

@@ -56,7 +56,7 @@ def fit_noise(
     redundancy: Array,
     *,
     relax: bool,
-) -> OdometryConfig:
+) -> tuple[OdometryConfig, Array]:
     """The settings of a track with the noise that its motions show, without floors.
 
     Where this no longer changes them they have the largest restricted likelihood, with a prior: the
@@ -71,28 +71,30 @@ def fit_noise(
         normalised: (n, 3) residuals by this noise, see `Residuals`.
         redundancy: (n, 3) see `Residuals`.
         relax: whether to go farther, as other fits follow until nothing changes.
+
+    Returns:
+        The settings, and the variances (n, 3) of the motions by them.
     """
     bare = without_floors(with_rates(track.config, np.zeros(len(RATES))))
-    known = motion_variances(track, bare, times_ns)
-    C = variances_by_rate(track, *times_ns)
-    moved = C.any(axis=(1, 2))
+    known, gained = motion_variances(track, bare, times_ns), variances_by_rate(track, *times_ns)
+    moved = gained.any(axis=(1, 2))
     if not moved.any():
-        return bare
-    C, R, known, left = C[moved], variances[moved], known[moved], redundancy[moved]
+        return bare, known
+    C, R, least, left = gained[moved], variances[moved], known[moved], redundancy[moved]
     squared = clipped(normalised[moved]) ** 2  # expected: true variance / R
-    default = known + C @ [getattr(OdometryConfig(), name) for name in RATES]
+    default = least + C @ [getattr(OdometryConfig(), name) for name in RATES]
     # the logarithm of the variance, linear around R
     likely = 1.0 - np.mean(np.log(R / default), axis=0)
     prior = 2.0 / PRIOR_LOG_SIGMA**2
     weight = np.sqrt(np.concatenate([left, np.full(R.shape, prior / len(R))]))
-    b = np.concatenate([squared - known / R, likely - known / R]) * weight
+    b = np.concatenate([squared - least / R, likely - least / R]) * weight
     A = np.concatenate([C / R[:, :, None]] * 2) * weight[:, :, None]
     x = _non_negative(A.reshape(-1, len(RATES)), b.ravel())
     if relax:
-        before = np.maximum(np.mean(1.0 - known / R, axis=0), 1e-9)
+        before = np.maximum(np.mean(1.0 - least / R, axis=0), 1e-9)
         ratio = np.clip(np.mean(C @ x / R, axis=0) / before, 1.0 / FARTHEST, FARTHEST)
         x *= np.repeat(ratio ** _farther(left, prior), 3)
-    return with_rates(bare, x)
+    return with_rates(bare, x), known + gained @ x
 
 
 def _farther(left: Array, prior: float) -> Array:

@@ -200,7 +200,7 @@ def _is_measured(posterior: Posterior, source: Source) -> Array:
     the constant has about the right size, and tell nothing of a measurement.
     """
     seen = [a for *_, a in posterior.builder.bearings_and_ranges[source]]
-    sigmas = np.sqrt([np.diag(a.cov) for a in seen])
+    sigmas = np.sqrt(np.diagonal([a.cov for a in seen], axis1=1, axis2=2))
     ranges = np.array([a.z[1] for a in seen])
     return np.asarray(np.median(sigmas, axis=0) < [UNKNOWN_BEARING_RAD, np.median(ranges)])
 

@@ -17,6 +17,7 @@ from graphslam.core.records import (
     Step,
     Trajectory,
 )
+from graphslam.estimation.motion_arrays import increments_of
 from graphslam.estimation.motion_noise import (
     FEW_MOTIONS,
     fit_track_noise,
@@ -48,6 +49,10 @@ class Solution:
 
     steps: list
     stated: np.ndarray
+
+    @property
+    def made(self):
+        return increments_of(self.steps)
 
     def motions(self, robot, made, *, over_spans=False):
         variances = np.diagonal(made.cov, axis1=1, axis2=2)

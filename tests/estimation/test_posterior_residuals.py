@@ -5,7 +5,7 @@ import pytest
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import compose, rotation3
-from graphslam.core.motion_models import Calibration, Increments
+from graphslam.core.motion_models import Calibration
 from graphslam.core.records import Association, Estimate, Motion, Start, Step, Trajectory
 from graphslam.estimation.calibration_graph import CalibrationGraph
 
@@ -64,12 +64,8 @@ def test_what_is_left_in_all_residuals_are_the_redundant_measurements(sigma):
     rows are those around a start whose poses have turned since."""
     graph = solved(sigma)
     posterior = graph.posterior()
-    own = [step.motions["r"] for step in posterior.steps if "r" in step.motions]
-    made = Increments(*(
-        np.array([getattr(m, name) for m in own])
-        for name in ("delta", "cov", "d_delta_d_calibration")
-    ))  # fmt: skip
-    of_motions, of_points = posterior.motions("r", made), posterior.sightings(("r", "point"))
+    of_motions = posterior.motions("r", posterior.made["r"])
+    of_points = posterior.sightings(("r", "point"))
     left = [1.0 - of.absorbed / of.variance for of in (of_motions, of_points)]
     assert min(map(np.min, left)) > 0.0
     state = posterior.blocks.marginals[posterior.builder.state_key("r", 0)]
