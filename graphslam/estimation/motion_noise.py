@@ -41,9 +41,8 @@ MIN_SIGMA = 1e-4
 UNDERSTATED = 2.0
 #: median of the absolute value of a standard normal variable
 MEDIAN_OF_NORMAL = 0.6745
-#: of the sigma of a variance: smaller changes of it do not matter. Each is about half of the one
-#: before, so that all to come are about as large as the last
-NEGLIGIBLE = 0.75
+#: of the sigma of a variance: smaller changes of it do not matter
+NEGLIGIBLE = 0.5
 
 
 def noise_scales(
