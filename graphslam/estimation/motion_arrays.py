@@ -5,10 +5,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
 from graphslam.core.motion_models import Increments
 from graphslam.core.records import Motion, Step
-from graphslam.estimation.recorded_graph import IntArray
 
 
 def increments_of(steps: Sequence[Step]) -> dict[str, Increments]:
