@@ -23,6 +23,7 @@ from graphslam.sighting_smoothing.sighting_states import (
     state_times,
     steps_at_sightings,
     with_motions,
+    with_states_between,
 )
 
 
@@ -162,5 +163,6 @@ def _problem(
     tracks = {name: run.track for name, run in one.started.items()}
     begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
     steps = steps_at_sightings(one.steps, one.sources, late_ns, dropped)
+    steps = with_states_between(steps, tracks)
     problem = SightingProblem(steps, tracks, noise, one.kernel, begun_ns)
     return problem, at_states(estimate, steps, tracks)

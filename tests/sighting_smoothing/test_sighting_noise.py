@@ -60,7 +60,8 @@ def simulate(seed, *, seconds=SECONDS, late_s=0.0, shared=0.0, noise=1.0):
     return World(poses, noisy, seen, landmarks, START * rng.normal(size=3))
 
 
-def write(path, world, *, increments, named=True, stated=None, cov=SIGHTING_COV):
+def write(path, world, *, increments, named=True, stated=None, cov=SIGHTING_COV, sigmas=None):
+    """``sigmas`` (n, 3): those that increments state."""
     stamps = T0 + np.arange(len(world.poses)) * round(PERIOD_S * S)
     with LogWriter(path) as log:
         pose, last = np.zeros(3), 0
@@ -72,7 +73,8 @@ def write(path, world, *, increments, named=True, stated=None, cov=SIGHTING_COV)
             if not increments:
                 log.odometry("robot", stamp, pose, twist_variances=stated)
             elif k:
-                delta, moved = exp(world.twists[k - 1]), np.diag(ODOMETRY**2)
+                sigma = ODOMETRY if sigmas is None else sigmas[k - 1]
+                delta, moved = exp(world.twists[k - 1]), np.diag(sigma**2)
                 log.increment("robot", stamps[last], stamp, delta=delta, cov=moved)
             last = k
             while one is not None and one[0] == k:
@@ -145,6 +147,39 @@ def test_white_noise_is_used_as_well_as_by_the_plain_batch(tmp_path, increments,
     error, nees = np.mean(found, axis=0) / np.mean(best, axis=0)
     assert error < allowed
     assert 0.8 < nees < (1.25 if increments else 1.5)
+
+
+def test_the_path_where_nothing_is_seen_is_as_in_the_plain_batch(tmp_path):
+    """Laid between the states before and after it, it was 1.2 times as far off, NEES 1.5 times."""
+    ours, best = [], []
+    for seed in range(3):
+        world = simulate(seed)
+        # 6 s in every 10 s: the robot drives 2 m and turns
+        world = replace(world, seen=[one for one in world.seen if one[0] % 100 < 40])
+        ours.append(judge(solved(tmp_path / "log.mcap", world, increments=True), world))
+        best.append(batch(world))
+    error, nees = np.mean(ours, axis=0) / np.mean(best, axis=0)
+    assert error < 1.1
+    assert 0.8 < nees < 1.25
+
+
+def test_a_robot_that_stands_may_state_that_it_knows_it(tmp_path):
+    """The least sigma of each motion was taken for noise that contradicts what is stated."""
+    world, stands = simulate(0, seconds=30.0), 600
+    n = len(world.twists)
+    z = [one for one in world.seen if one[0] == n]
+    rng = np.random.default_rng(1)
+    seen = [
+        (n + k, i, mean + SIGHTING * rng.normal(size=2)) for k in range(stands) for _, i, mean in z
+    ]
+    twists = np.vstack([world.twists, np.zeros((stands, 3))])
+    poses = np.vstack([world.poses, np.tile(world.poses[-1], (stands, 1))])
+    world = replace(world, poses=poses, twists=twists, seen=world.seen + seen)
+    sigmas = np.vstack([np.tile(ODOMETRY, (n, 1)), np.full((stands, 3), 1e-6)])
+    result = solved(tmp_path / "log.mcap", world, increments=True, sigmas=sigmas)
+    measured = result.summary["noise"]["robot motion"]["measured"]
+    assert max(measured.values()) < 2.0
+    assert result.summary["verdict"]["verdict"] == "good"
 
 
 def test_without_names_every_point_is_in_the_map_once(tmp_path):
