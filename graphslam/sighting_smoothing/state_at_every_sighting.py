@@ -93,6 +93,7 @@ class SightingProblem:
             rough=rough,
             solved_once=solved_once,
             shared=self.noise.shared_errors,
+            settle=not rough,
         )
 
     def at_sightings(

@@ -205,6 +205,29 @@ def test_unstated_noise_of_odometry_is_found(tmp_path):
         assert each @ amounts / len(moved) == pytest.approx(true**2, rel=0.35)
 
 
+def test_noise_of_odometry_is_not_taken_for_errors_that_sightings_share(tmp_path):
+    """Of odometry that is taken for less noisy than it is, residuals of sightings keep a part."""
+    for seed in range(2):
+        world = simulate(seed, seconds=200.0)
+        slips = np.random.default_rng(seed).normal(size=len(world.twists))
+        world = replace(world, twists=world.twists + np.outer(slips, [0.0, 0.0, 0.05]))
+        world = replace(world, seen=[one for one in world.seen if one[0] % 3 == 0])
+        result = solved(tmp_path / "log.mcap", world, increments=False)
+        assert result.summary["noise"]["robot point"]["shared"] == [0.0, 0.0]
+
+
+def test_a_scale_that_nothing_shows_is_not_found(tmp_path):
+    """Bearings alone tell nothing of a scale: it was found as 0.67 too small, as the motions by
+    which it was computed were those of a solution by another noise."""
+    world = simulate(0, seconds=200.0)
+    world = replace(world, seen=[(k, i, np.array([z[0], 1.0])) for k, i, z in world.seen])
+    cov = np.diag([SIGHTING[0] ** 2, 1e4])
+    result = solved(tmp_path / "log.mcap", world, increments=False, cov=cov)
+    scale = result.summary["calibration"]["robot.translation_scale"]
+    assert scale["sigma"] == pytest.approx(0.03, rel=0.1)
+    assert abs(scale["value"]) < 0.06
+
+
 def test_noise_that_few_sightings_show_is_not_taken_for_less_than_it_may_be(tmp_path):
     """One or two points in three seconds, eight draws: by the likeliest noise the mean NEES per
     degree of freedom is 2.0, by the true noise it is 1. A log has few independent errors: 0.4."""
