@@ -14,6 +14,7 @@ import numpy as np
 from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, between
+from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step, Trajectory
 from graphslam.estimation.calibration_graph import (
@@ -29,6 +30,9 @@ from graphslam.odometry.preintegration import Track
 
 #: times that everything is solved: after the first the calibration moves by a tenth of its sigma
 ROUNDS = 2
+
+#: of its sigma: by how much a calibration moves at most in the last round, and rounds more for that
+SETTLED_SIGMAS, MORE_ROUNDS = 2.0, 6
 
 #: (latest estimate, whether it is the last round) -> steps computed with the tracks' calibration,
 #: whose own errors their covariances leave out
@@ -47,6 +51,7 @@ def calibrate(
     solved_once: Callable[[CalibratedSolution, Sequence[Step]], None] | None = None,
     shared: Mapping[Source, ObservationNoise] | None = None,
     bias_m: float | None = None,
+    settle: bool = False,
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve for states, landmarks and calibrations together, ``rounds`` times.
 
@@ -55,15 +60,18 @@ def calibrate(
     information, and the steps behind it. All rounds but the last converge roughly, with ``rough``
     that one too. ``solved_once`` is called with every solution and its steps. ``shared``: noise of
     sightings that share errors; covariances are then those of `sandwich_covariance`, if not rough.
-    ``bias_m``: of surfaces, see `CalibrationGraph.solution`.
+    ``bias_m``: of surfaces, see `CalibrationGraph.solution`. ``settle``: the last round, which is
+    not rough, is repeated until the calibrations no longer move. What they change in the motions is
+    as in the estimate before; where sightings tell little of a scale and the estimate before was by
+    another noise, that alone moves it.
 
     Raises:
         EstimationError: the estimate is indeterminate.
     """
     priors = {name: track.prior for name, track in tracks.items()}
     steps: tuple[Step, ...] = ()
-    for k in range(rounds):
-        last = k == rounds - 1
+    for k in range(rounds + MORE_ROUNDS * settle):
+        last = k >= rounds - 1
         initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
             track.calibration = track.calibration.held()
@@ -84,9 +92,21 @@ def calibrate(
             track.calibration = solved.calibrations[name]
         if solved_once is not None:
             solved_once(solved, steps)
+        if last and not _has_moved(initial, solved.calibrations):
+            break
     if rounds and shared is not None and not rough:
         estimate = solved.graph.covariance_factors(shared).applied_to(estimate)
     return estimate, at_calibration(steps, initial, solved.calibrations) if rounds else steps
+
+
+def _has_moved(before: Mapping[str, Calibration], after: Mapping[str, Calibration]) -> bool:
+    """Whether a calibration has moved by more than `SETTLED_SIGMAS`; not if these are unknown."""
+    for name, found in after.items():
+        moved = np.abs(found.mean - before[name].mean)
+        sigma = np.sqrt(np.diag(found.cov))
+        if np.any(moved[sigma > HELD_SIGMA] > SETTLED_SIGMAS * sigma[sigma > HELD_SIGMA]):
+            return True
+    return False
 
 
 def calibrate_roughly(

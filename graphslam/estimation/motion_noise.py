@@ -211,7 +211,9 @@ def measured_motion_noise(track: Track, robot: str, posterior: Posterior) -> Arr
     of = spans(np.append(begin[0], end))
     over = begin[of[:, 0]], end[of[:, 1] - 1]
     found = posterior.motions(robot, _joined(posterior.made[robot], of), over_spans=True)
-    stated = np.maximum(motion_variances(track, track.config, over), MIN_SIGMA**2)
+    # every motion was solved with a least sigma, as where the robot stands
+    least = MIN_SIGMA**2 * np.diff(of, axis=1)
+    stated = np.maximum(motion_variances(track, track.config, over), least)
     return found.variance_factor() * np.median(found.variance / stated, axis=0)
 
 

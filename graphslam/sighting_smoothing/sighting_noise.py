@@ -39,6 +39,9 @@ from graphslam.sighting_smoothing.sighting_states import (
 MAX_SIGHTINGS = 5000
 #: rounds at most; the noise has converged when no variance changes by a larger share
 MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
+#: where odometry is taken for less noisy than it is, errors seem to be shared: this is looked at
+#: again if its variance changes by a larger share
+UNSETTLED_SHARE = 1.0
 #: relative decrease of the error at which optimisation ends
 CONVERGED_ERROR = 1e-4
 #: smallest factor on a stated variance on the way, for logs without noise
@@ -65,7 +68,8 @@ def estimate_noise(
         estimate: of the states and landmarks of ``steps``.
         tracks: odometry of every robot; they get the calibration that is found on the way.
         config: settings.
-        rounds: at most. Errors that are shared show in the first, which is the last then.
+        rounds: at most. Errors that are shared show in the first, which is the last then, unless
+            the odometry is much noisier than it was taken for.
 
     Raises:
         EstimationError: the estimate is indeterminate.
@@ -143,7 +147,7 @@ def _estimated(
         new = _sighting_noise(posterior, noise)
         change = _largest_change(noise, new)
         noise = new
-        covs = graph.calibration_covariances(posterior)
+        covs, odometry_change = graph.calibration_covariances(posterior), 0.0
         for name, track in tracks.items():
             track.calibration = replace(calibrations[name], cov=covs[name])
             if name in stated:
@@ -153,8 +157,10 @@ def _estimated(
                 continue
             fit = fits[name] = fit_track_noise(track, name, posterior, relax=is_white(noise))
             track.config = without_floors(track.config)
-            change = max(change, fit.change if fit else 0.0)
-        if change < CONVERGED_SHARE or not is_white(noise):
+            odometry_change = max(odometry_change, fit.change if fit else 0.0)
+        if max(change, odometry_change) < CONVERGED_SHARE:
+            break
+        if not is_white(noise) and odometry_change < UNSETTLED_SHARE:
             break
     for name, fit in fits.items():
         if fit is not None:

@@ -4,6 +4,7 @@ Where the noise of sightings is white, every one of them counts: it enters from 
 time, and what it shares with others by odometry is in the motions between the states.
 """
 
+import itertools
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -35,6 +36,8 @@ from graphslam.pipeline.sighting_batches import transport_batch
 
 #: ns: velocities are the motion from so long before to so long after
 BASELINE_NS = 250_000_000
+#: m of `Track.effort`: where nothing is seen, states are at most so far from each other
+APART_M = 0.5
 
 
 def steps_at_sightings(
@@ -122,6 +125,38 @@ def measured_from_bases(sightings: Sequence[Sighting]) -> tuple[Array, Array]:
         return transport_batch(z, cov, mounts, np.zeros((3, 3))) if mounts.any() else (z, cov)
     each = [measured_from_base(s) for s in sightings]
     return np.array([z for z, _ in each]), np.array([cov for _, cov in each])
+
+
+def with_states_between(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:
+    """Steps with more states where robots drove for `APART_M` without a sighting.
+
+    A path of metres between two states is not told by these and the odometry alone: where its
+    heading was off decides how far off the places on the way are. Only states there know that.
+
+    Args:
+        steps: whose motions have times alone, see `steps_at_sightings`.
+        tracks: odometry of every robot.
+    """
+    own: dict[str, list[tuple[int, Motion]]] = defaultdict(list)
+    for n, step in enumerate(steps):
+        for robot, motion in step.motions.items():
+            own[robot].append((n, motion))
+    made, between_states = list(steps), []
+    for robot, motions in own.items():
+        track = tracks[robot]
+        ends = np.array([(m.start_ns, m.end_ns) for _, m in motions], dtype=np.int64)
+        begin, end = track.effort(ends).T
+        for k in np.flatnonzero(end - begin > APART_M).tolist():
+            parts = int(np.ceil((end[k] - begin[k]) / APART_M))
+            levels = np.linspace(begin[k], end[k], parts + 1)[1:-1]
+            inner = np.unique(track.times_of_effort(levels))
+            first, last = ends[k].tolist()
+            times = [first, *inner[(inner > first) & (inner < last)].tolist(), last]
+            *passed, final = itertools.pairwise(times)
+            between_states += [Step(b, {}, {robot: timed_motion(a, b)}) for a, b in passed]
+            n = motions[k][0]
+            made[n] = replace(made[n], motions={**made[n].motions, robot: timed_motion(*final)})
+    return tuple(sorted([*made, *between_states], key=lambda step: step.time_ns))
 
 
 def timed_motion(start_ns: int, end_ns: int) -> Motion:

@@ -23,6 +23,7 @@ from graphslam.sighting_smoothing.sighting_states import (
     state_times,
     steps_at_sightings,
     with_motions,
+    with_states_between,
 )
 
 
@@ -92,6 +93,7 @@ class SightingProblem:
             rough=rough,
             solved_once=solved_once,
             shared=self.noise.shared_errors,
+            settle=not rough,
         )
 
     def at_sightings(
@@ -162,5 +164,6 @@ def _problem(
     tracks = {name: run.track for name, run in one.started.items()}
     begun_ns = {name: step.time_ns for step in one.steps for name in step.starts}
     steps = steps_at_sightings(one.steps, one.sources, late_ns, dropped)
+    steps = with_states_between(steps, tracks)
     problem = SightingProblem(steps, tracks, noise, one.kernel, begun_ns)
     return problem, at_states(estimate, steps, tracks)
