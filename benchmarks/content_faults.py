@@ -320,6 +320,11 @@ def faults() -> dict[str, Fault]:
     made["bearings in degrees"] = Fault(
         lambda m: sighted(m, lambda a: replace(a, z=a.z * (180 / np.pi, 1))), see, Sighting
     )
+    made["bearings 3 degrees off"] = Fault(
+        lambda m: sighted(m, lambda a: replace(a, z=a.z + np.array([np.radians(3.0), 0.0]))),
+        see,
+        Sighting,
+    )
     made["one name for all"] = Fault(
         lambda m: sighted(m, lambda a: replace(a, identity="x")), see, Sighting
     )

@@ -22,6 +22,7 @@ from graphslam.verdict.regular_landmarks import regular_landmark_doubts
 from graphslam.verdict.scan_doubts import scan_doubts
 from graphslam.verdict.sighting_doubts import sighting_doubts
 from graphslam.verdict.told_starts import contradictions
+from graphslam.verdict.turned_sensors import turned_sensor_doubts
 from graphslam.verdict.vanished_points import vanished_doubts
 
 #: factors on a stated variance that a log shows: from the first one doubtful, from the other bad
@@ -235,6 +236,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "odometry": odometry_doubts,
     "scans": scan_doubts,
     "sightings": sighting_doubts,
+    "turned sensors": turned_sensor_doubts,
     "regular landmarks": regular_landmark_doubts,
     "points": vanished_doubts,
     "moved": moved_doubts,
