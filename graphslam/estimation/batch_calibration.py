@@ -132,7 +132,7 @@ def calibrate_roughly(
     for _ in range(rounds):
         for name, track in tracks.items():
             track.calibration = now[name].held()
-        # not what the calibration changes in motions as estimated: those are far off in places
+        # with the derivative at the measured motions: the estimated ones are far off in places
         problem.calibrate_motions(recompute_motions(steps, tracks), now)
         estimate, now = problem.solve(CONVERGED_ERROR_ROUGH)
     for name, track in tracks.items():

@@ -128,7 +128,7 @@ class GraphBuilder:
     def state_keys(self, robot: str, first: int = 0) -> list[int]:
         """Keys of a robot's states from number ``first`` on, which counts from the end if < 0."""
         key = self._first_keys[robot]
-        return list(range(key, key + len(self.states.times[robot])))[first:]
+        return list(range(key, key + len(self.states.times[robot]))[first:])
 
     def factor_groups(self, step: Step, estimate: Estimates) -> Iterator[FactorGroup]:
         """The factors of a step, group by group in recorded order.

@@ -85,6 +85,11 @@ def read(values: gtsam.Values, key: int, dim: int) -> Array:
     return array3(values.atPose2(key)) if dim == 3 else np.asarray(values.atPoint2(key))
 
 
+def read_poses(values: gtsam.Values) -> Array:
+    """All poses (n, 3), m and rad, in the order of their keys: those of lines before states."""
+    return np.ascontiguousarray(gtsam.utilities.extractPose2(values))
+
+
 def write(values: gtsam.Values, key: int, value: Array) -> None:
     """Insert a variable with its value (2,) or (3,)."""
     values.insert(key, pose2(value) if len(value) == 3 else value)

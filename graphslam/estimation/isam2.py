@@ -394,9 +394,8 @@ def with_means(
 ) -> dict[int, tuple[Array, Array]]:
     """Mean (d,) and covariance (d, d), NaN if missing in ``covs``, of every variable."""
     unknown = {dim: np.full((dim, dim), np.nan) for dim in (2, 3)}
-    # one call for all poses: in the order of their keys
     poses = sorted(key for key, dim in dims.items() if dim == 3)
-    means = dict(zip(poses, gtsam.utilities.extractPose2(values).copy("C"), strict=True))
+    means = dict(zip(poses, factors.read_poses(values), strict=True))
     return {
         key: (
             means[key] if dim == 3 else factors.read(values, key, dim),

@@ -167,12 +167,11 @@ class RecordedGraph(BatchGraph):
 
     def poses_at(self, values: gtsam.Values, keys: IntArray) -> Array:
         """The values (n, 3) of states by their keys (n,); ``values`` are of the whole graph."""
-        # one call for all: in the order of the keys, those of lines first
         every = np.concatenate(
             [np.array(self.state_keys(robot), dtype=np.int64) for robot in self.robots]
         )
-        poses = gtsam.utilities.extractPose2(values)[-len(every) :]
-        return np.ascontiguousarray(poses[np.searchsorted(every, keys)])
+        poses = factors.read_poses(values)[-len(every) :]
+        return np.asarray(poses[np.searchsorted(every, keys)])
 
     @property
     def observes_walls(self) -> bool:

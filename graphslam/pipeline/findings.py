@@ -12,8 +12,8 @@ from graphslam.pipeline.robot_state import Causal
 class Findings(NamedTuple):
     """Results of a pass besides its estimate.
 
-    ``swapped_identities``: false identity -> right one; ``clocks``: the
-    robots' clocks as their sightings of each other show them; ``causal``: causal trajectories.
+    ``swapped_identities``: false identity -> right one; ``clocks``: the robots' clocks as their
+    sightings of each other show them; ``causal``: causal trajectories.
     """
 
     swapped_identities: Mapping[str, str]

@@ -1,4 +1,4 @@
-"""Steps and closures solved again and again, while a log of several robots is reoptimised."""
+"""Steps and closures solved again and again, while a log of scans is reoptimised."""
 
 from collections.abc import Sequence
 

@@ -37,7 +37,7 @@ from graphslam.pipeline.sighting_batches import transport_batch
 #: ns: velocities are the motion from so long before to so long after
 BASELINE_NS = 250_000_000
 #: m of `Track.effort`: where nothing is seen, states are at most so far from each other
-APART_M = 0.5
+MAX_SPACING_M = 0.5
 
 
 def steps_at_sightings(
@@ -128,7 +128,7 @@ def measured_from_bases(sightings: Sequence[Sighting]) -> tuple[Array, Array]:
 
 
 def with_states_between(steps: Sequence[Step], tracks: Mapping[str, Track]) -> tuple[Step, ...]:
-    """Steps with more states where robots drove for `APART_M` without a sighting.
+    """Steps with more states where robots drove for `MAX_SPACING_M` without a sighting.
 
     A path of metres between two states is not told by these and the odometry alone: where its
     heading was off decides how far off the places on the way are. Only states there know that.
@@ -146,8 +146,8 @@ def with_states_between(steps: Sequence[Step], tracks: Mapping[str, Track]) -> t
         track = tracks[robot]
         ends = np.array([(m.start_ns, m.end_ns) for _, m in motions], dtype=np.int64)
         begin, end = track.effort(ends).T
-        for k in np.flatnonzero(end - begin > APART_M).tolist():
-            parts = int(np.ceil((end[k] - begin[k]) / APART_M))
+        for k in np.flatnonzero(end - begin > MAX_SPACING_M).tolist():
+            parts = int(np.ceil((end[k] - begin[k]) / MAX_SPACING_M))
             levels = np.linspace(begin[k], end[k], parts + 1)[1:-1]
             inner = np.unique(track.times_of_effort(levels))
             first, last = ends[k].tolist()
