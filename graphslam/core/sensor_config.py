@@ -126,7 +126,8 @@ class OdometryConfig:
     fixed_calibration: parameters held at what the log and [robots.*] say.
     calibration_floor_m, calibration_floor_rad: error of an estimated motion that calibration does
     not explain by odometry (stamps, walls that are not flat).
-    max_gap_s: longest span without odometry that is bridged. max_speed_m_s, max_turn_rad_s: a
+    max_gap_s: longest span without odometry that is bridged; no pose is reported in a longer one in
+    which the robot moved, unless it has scans. max_speed_m_s, max_turn_rad_s: a
     faster motion between two readings means stamps in a burst, which do not tell when it took
     place; half of max_speed_m_s for 10 ms or longer means that the odometry was reset.
     scan_matching: use of relative motions from matching consecutive scans: `auto` = they replace

@@ -23,9 +23,8 @@ from graphslam.core.record import replace
 from graphslam.core.records import Message, OdometryPose, Scan
 from graphslam.odometry.laser_odometry import LaserOdometry
 from graphslam.odometry.preintegration import Track
+from graphslam.odometry.reading_gaps import GAP_S
 
-#: s without odometry that are a gap
-GAP_S = 1.0
 #: scans in front of a gap that the first in it is matched with
 SCANS_BEFORE = 6
 #: m, rad: sigmas of the position and of the heading in a gap up to which it is bridged; the heading

@@ -28,6 +28,7 @@ from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, ScanTies, Start, Step, Trajectory
 from graphslam.odometry.preintegration import Track
+from graphslam.odometry.reading_gaps import covs_in_gaps
 
 #: squared distance, three degrees of freedom, and m, rad, beyond which a motion that odometry did
 #: not see is no noise. Where it is less, Intel's scans between states are better placed by noise
@@ -175,6 +176,7 @@ def final_at(
     interval = _Interval.of(states, track, times_ns)
     poses = _between(states, interval)
     noise = rotate_cov(interval.noise_between(), states.poses[interval.before, 2] - poses[:, 2])
+    noise = noise + covs_in_gaps(track, times_ns - track.latency_ns)
     return Trajectory(stamps_ns, poses, _covs(states, interval, poses, noise))
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphslam.core.arrays import IntArray
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.mount_covariances import MountCovariance
@@ -25,6 +25,7 @@ from graphslam.odometry.interpolation import (
 from graphslam.odometry.mount_covariance import base_trajectory
 from graphslam.odometry.online_calibration import Calibrator, to_summary
 from graphslam.odometry.preintegration import Track
+from graphslam.odometry.reading_gaps import moved_in_gaps
 from graphslam.odometry.readings import EDGE_NS
 from graphslam.perception.scan_matching import Submap
 from graphslam.pipeline.repeated_scans import RepeatedScans
@@ -33,7 +34,7 @@ from graphslam.pipeline.scans_since_keyframe import ScansSinceKeyframe
 
 #: Hz at which the base of a robot without scans is reported
 BASE_RATE_HZ = 10
-#: poses are not reported in gaps of the odometry that are longer
+#: poses are not reported in gaps of the odometry that are longer, though the robot stands in them
 LONGEST_GAP_NS = 600_000_000_000
 
 
@@ -230,17 +231,19 @@ class RobotState:
             stamps, times = (np.array([scan[k] for scan in scans], dtype=np.int64) for k in (0, 1))
             return stamps, times, np.array([scan[2] for scan in scans])
         period = round(1e9 / BASE_RATE_HZ)
-        times = times_of_readings(self.track.times, period)
+        longest_ns = round(1e9 * self.track.config.max_gap_s)
+        unknown = moved_in_gaps(self.track, longest_ns)
+        times = times_of_readings(self.track.times, period, unknown)
         return self.clock.to_local(times), times, np.zeros((0, 3))
 
 
-def times_of_readings(readings_ns: IntArray, period_ns: int) -> IntArray:
-    """Times (n,) at an even rate from the first to the last reading, none in long gaps.
+def times_of_readings(readings_ns: IntArray, period_ns: int, unknown: BoolArray) -> IntArray:
+    """Times (n,) at an even rate from the first to the last reading (m,), none in long gaps.
 
     There is nothing to report where nothing was recorded, and a clock that steps by years would
-    fill the memory.
+    fill the memory. ``unknown`` (m - 1,): after which readings it is not known where the robot was.
     """
-    breaks = np.flatnonzero(np.diff(readings_ns) > LONGEST_GAP_NS)
+    breaks = np.flatnonzero(unknown | (np.diff(readings_ns) > LONGEST_GAP_NS))
     begins = readings_ns[np.concatenate([[0], breaks + 1])]
     ends = readings_ns[np.concatenate([breaks, [len(readings_ns) - 1]])]
     return np.concatenate(

@@ -260,9 +260,9 @@ def test_limits_of_robots_and_their_names(tmp_path):
 def test_a_clock_that_steps_by_years_does_not_fill_the_gap_with_poses():
     year = 365 * 86400 * S
     readings = np.concatenate([np.arange(0, 20 * S, S), year + np.arange(0, 20 * S, S)])
-    times = times_of_readings(readings, S // 10)
+    times = times_of_readings(readings, S // 10, np.zeros(39, dtype=bool))
     assert len(times) == 2 * 191 and times[0] == 0 and times[-1] == year + 19 * S
-    whole = times_of_readings(readings[:20], S // 10)
+    whole = times_of_readings(readings[:20], S // 10, np.zeros(19, dtype=bool))
     assert whole.tolist() == list(range(0, 19 * S + 1, S // 10))
 
 
