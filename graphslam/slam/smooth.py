@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 from graphslam.core.config import Config
-from graphslam.core.errors import ConfigError
+from graphslam.core.errors import ConfigError, EstimationError
 from graphslam.core.records import Result
 from graphslam.logs import LogSet
 from graphslam.mapping.known_map import KnownMap
@@ -19,6 +19,7 @@ from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.scan_smoothing.log_reader import Reading
 from graphslam.scan_smoothing.scan_log import solve_scan_log
 from graphslam.scan_smoothing.session_log import solve_session_log
+from graphslam.slam.failures import explained
 from graphslam.slam.final_result import make_result
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.passes import run_passes
@@ -60,7 +61,10 @@ def smooth(
             "are localised in a known map"
         )
     job = SmoothingJob(log, config, progress, tamper, kept)
-    result = kept.stage("result", partial(_solved, job, known_map, ahead, began))
+    try:
+        result = kept.stage("result", partial(_solved, job, known_map, ahead, began))
+    except EstimationError as error:
+        raise explained(error, log, config) from error
     summary = {**result.summary, "resumed": kept.resumed}
     return replace(result, summary=summary)
 

@@ -9,7 +9,7 @@ from itertools import chain
 
 import numpy as np
 
-from graphslam.core.arrays import stretches
+from graphslam.core.arrays import IntArray, stretches
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.pipeline.path_evidence import FACTORS as PATH_FACTORS
 from graphslam.pipeline.path_evidence import better_fit
@@ -130,29 +130,48 @@ def _left_out(robot: RobotEvidence) -> Iterator[Reason]:
 
 
 def _speed(robot: RobotEvidence) -> Iterator[Reason]:
-    moved, apart = _steps(robot)
-    if robot.resets > max(3, 0.02 * len(apart)):
-        yield _reason(
-            robot,
-            "bad",
-            f"jumps {robot.resets} times, or is not in metres: it is faster than robots drive",
-        )
+    impossible = impossible_speed(robot.readings_ns, robot.readings, robot.resets)
+    yield from (_reason(robot, "bad", text) for text in impossible)
+    if robot.resets <= _most_resets(len(robot.readings)):
+        path, _ = _moved_in_seconds(robot.readings_ns, robot.readings)
+        yield from _creep(robot, path)
+
+
+def impossible_speed(readings_ns: IntArray, readings: Array, resets: int) -> Iterator[str]:
+    """What odometry does that no robot can, as of a wrong unit, to be read after "its odometry".
+
+    Args:
+        readings_ns: (n,) times.
+        readings: (n, 3) poses by odometry alone, its resets bridged.
+        resets: how many there are.
+    """
+    if resets > _most_resets(len(readings)):
+        yield f"jumps {resets} times, or is not in metres: it is faster than robots drive"
         return
-    # over a second: stamps may come in bursts
-    path = np.concatenate([[0.0], np.cumsum(np.hypot(moved[:, 0], moved[:, 1]))])
-    turn = np.concatenate([[0.0], np.cumsum(np.abs(moved[:, 2]))])
-    times = (robot.readings_ns - robot.readings_ns[0]) * 1e-9
-    grid = np.arange(0.0, times[-1], 1.0)
-    for total, most, unit, hint in (
+    path, turn = _moved_in_seconds(readings_ns, readings)
+    for rates, most, unit, hint in (
         (path, TOP_SPEED_M_S, "m/s", "metres"),
         (turn, TOP_TURN_RAD_S, "rad/s", "radians"),
     ):
-        rates = np.diff(np.interp(grid, times, total))
         if len(rates) and np.quantile(rates, FAST_SHARE) > most:
             fast = float(np.quantile(rates, FAST_SHARE))
-            text = f"moves at {fast:.3g} {unit}, which no robot does: is it in {hint}?"
-            yield _reason(robot, "bad", text)
-    yield from _creep(robot, np.diff(np.interp(grid, times, path)))
+            yield f"moves at {fast:.3g} {unit}, which no robot does: is it in {hint}?"
+
+
+def _most_resets(readings: int) -> float:
+    return max(3, 0.02 * (readings - 1))
+
+
+def _moved_in_seconds(readings_ns: IntArray, readings: Array) -> tuple[Array, Array]:
+    """Path (n,), m, and turning (n,), rad, in every second: stamps may come in bursts."""
+    moved = between(readings[:-1], readings[1:])
+    times = (readings_ns - readings_ns[0]) * 1e-9
+    grid = np.arange(0.0, times[-1], 1.0)
+
+    def rates(step: Array) -> Array:
+        return np.diff(np.interp(grid, times, np.concatenate([[0.0], np.cumsum(step)])))
+
+    return rates(np.hypot(moved[:, 0], moved[:, 1])), rates(np.abs(moved[:, 2]))
 
 
 def _creep(robot: RobotEvidence, speeds: Array) -> Iterator[Reason]:
