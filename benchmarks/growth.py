@@ -2,6 +2,7 @@
 
 - *Landmarks*: one robot goes to and fro over a field of named points, 1 to every 4 m2, and sees
   those within 4 m: a log of n landmarks has n / 2 m of path and sees each some eight times.
+- *Without names*: the same points, to half of that number, whose sightings are associated.
 - *Length*: rounds of the office ring (laser), and of a field with 40 named points.
 
 Memory is the peak of one process (and of its second one) over all of `graphslam smooth`; exponents
@@ -26,6 +27,8 @@ from graphslam.logs import LogWriter
 
 S = 1_000_000_000
 LANDMARKS, ROUNDS = (1000, 2000, 4000, 8000, 16_000), (1, 2, 4, 8)
+#: of the landmarks, that are tried without names, too
+UNNAMED_SHARE = 0.5
 #: bars: of exponents, and MB for 10 000 landmarks
 STEEPEST, MOST_MB = 1.1, 1500.0
 #: m2 of each landmark, m that the robot sees, m between its rows, m/s
@@ -33,8 +36,10 @@ AREA_M2, REACH_M, ROW_M, SPEED = 4.0, 4.0, 8.0, 1.0
 ODOMETRY_HZ, SIGHTING_HZ = 5, 1
 
 
-def field(target: Path, landmarks: int, rounds: int = 1, seed: int = 1) -> Path:
-    """A robot that goes to and fro over a square field of named points, several times."""
+def field(
+    target: Path, landmarks: int, rounds: int = 1, seed: int = 1, *, named: bool = True
+) -> Path:
+    """A robot that goes to and fro over a square field of points, several times."""
     rng = np.random.default_rng(seed)
     side = math.sqrt(AREA_M2 * landmarks)
     points = rng.uniform(0, side, (landmarks, 2))
@@ -56,18 +61,26 @@ def field(target: Path, landmarks: int, rounds: int = 1, seed: int = 1) -> Path:
                 odometry = compose(odometry, moved + noise)
             log.odometry("robot", stamp, odometry)
             if k % (ODOMETRY_HZ // SIGHTING_HZ) == 0:
-                see(log, stamp, pose, points, rng)
+                see(log, stamp, pose, points, rng, named)
     return target
 
 
-def see(log: LogWriter, stamp: int, pose: Array, points: Array, rng: np.random.Generator) -> None:
+def see(
+    log: LogWriter,
+    stamp: int,
+    pose: Array,
+    points: Array,
+    rng: np.random.Generator,
+    named: bool,
+) -> None:
     """What is seen from a pose (3,) of points (n, 2)."""
     away = points - pose[:2]
     distances = np.hypot(*away.T)
     for n in np.flatnonzero(distances < REACH_M).tolist():
         bearing = math.atan2(away[n, 1], away[n, 0]) - pose[2] + rng.normal(0, 0.01)
         z = np.array([math.remainder(bearing, 2 * math.pi), distances[n] + rng.normal(0, 0.03)])
-        log.sighting("robot", stamp, z, np.diag([1e-4, 9e-4]), identity=f"p{n}")
+        identity = f"p{n}" if named else None
+        log.sighting("robot", stamp, z, np.diag([1e-4, 9e-4]), identity=identity)
 
 
 def drive(way: Array) -> Array:
@@ -123,13 +136,21 @@ def main() -> int:
             log = folder / f"marks-{count}.mcap"
             return log if log.exists() else field(log, count)
 
+        def unnamed(count: int) -> Path:
+            log = folder / f"unnamed-{count}.mcap"
+            return log if log.exists() else field(log, count, named=False)
+
         def again(count: int) -> Path:
             log = folder / f"again-{count}.mcap"
             return log if log.exists() else field(log, 40, 20 * count)
 
         print("| what | size | memory, MB | CPU, s |\n|---|---|---|---|")
         base_mb = rows("a short log", (20,), marks, folder)[0][2]
-        found = rows("landmarks", arguments.landmarks, marks, folder) if arguments.landmarks else []
+        found = []
+        if arguments.landmarks:
+            found = rows("landmarks", arguments.landmarks, marks, folder)
+            fewer = [round(UNNAMED_SHARE * count) for count in arguments.landmarks]
+            found += rows("unnamed landmarks", fewer, unnamed, folder)
         if arguments.rounds:
             found += rows("rounds of 40 landmarks", arguments.rounds, again, folder)
             found += rows(

@@ -30,7 +30,8 @@ from graphslam.mapping.gating import (
     gate_floor,
     jointly_compatible,
 )
-from graphslam.mapping.landmark_map import Entry, LandmarkMap
+from graphslam.mapping.landmark_index import reach
+from graphslam.mapping.landmark_map import Entry, LandmarkMap, means_and_extents
 from graphslam.mapping.pair_selection import assign_pairs, known_alone, worth_comparing
 from graphslam.mapping.robot_candidates import (
     NOT_THERE,
@@ -125,6 +126,7 @@ class Associator:
         self._config, self._backend = config, backend
         self._images = 0
         self._unsettled: set[int] = set()  # admitted, but not yet in the back end
+        self._admitted: set[int] = set()  # see `take_admitted`
         self._deleted: list[int] = []  # of the graph, see `take_deleted`
         self._floor = gate_floor(config)
 
@@ -172,6 +174,11 @@ class Associator:
         deleted, self._deleted = tuple(self._deleted), []
         return deleted
 
+    def take_admitted(self) -> set[int]:
+        """The landmarks that entered the graph since the last call."""
+        admitted, self._admitted = self._admitted, set()
+        return admitted
+
     def settle(self) -> None:
         """Record that the back end has taken the step of all associations so far."""
         self._unsettled.clear()
@@ -179,12 +186,19 @@ class Associator:
     def _candidates(self, image: Image) -> Candidates:
         """Candidate pairs of an image and their distances."""
         seen = image.seen
-        ids, means, extents, is_point, whole = self.map.arrays()
         free = [n for n, o in enumerate(seen) if o.is_landmark and not self._has_identity(o)]
+        unnamed, near = [seen[n] for n in free], list[Entry]()
+        if free:
+            near = self.map.near(reach(unnamed, image.predicted, self._config))
         pairs = candidate_pairs(
-            [seen[n] for n in free], image.predicted, means, extents, is_point, whole, self._config
+            unnamed,
+            image.predicted,
+            *means_and_extents(near),
+            np.array([e.kind == "point" for e in near], dtype=bool),
+            np.array([e.kind == "segment" for e in near], dtype=bool),
+            self._config,
         )
-        entries = [self.map.entries[int(ids[j])] for j in pairs.landmark]
+        entries = [near[j] for j in pairs.landmark]
         last_m = np.array([e.path_m.get(image.robot, -np.inf) for e in entries])
         recent = image.path_m - last_m <= self._config.reacquire_m
         keep = worth_comparing(pairs, entries, recent, self._config.reacquire_min)
@@ -391,8 +405,9 @@ class Associator:
         entry.evidence.append(seen)
         if not certain and entry.sightings < self._config.sightings_to_promote:
             return []
-        entry.in_graph = True
+        self.map.promote(entry)
         self._unsettled.add(entry.id)
+        self._admitted.add(entry.id)
         if entry.kind == "segment" and any(e.model != "segment" for e in entry.evidence):
             entry.kind = "line"
         waiting, entry.evidence = entry.evidence, []

@@ -429,3 +429,4 @@ def merge_entries(landmarks: LandmarkMap, into: Mapping[int, int]) -> None:
         new.sightings += old.sightings
         new.first_ns = min(new.first_ns, old.first_ns)
         new.last_ns = max(new.last_ns, old.last_ns)
+    landmarks.drop_index()

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphslam.core.arrays import BoolArray, IntArray
+from graphslam.core.arrays import IntArray
 from graphslam.core.errors import LogError
 from graphslam.core.geometry import Array, between, compose, rotate_cov
 from graphslam.core.observation_models import MODELS
@@ -25,6 +25,7 @@ from graphslam.core.records import (
 )
 from graphslam.core.sensor_config import LimitsConfig
 from graphslam.estimation.backend import Backend
+from graphslam.mapping.landmark_index import LandmarkIndex
 
 #: m: landmarks of an earlier map that are nearer to each other are known to be different things
 KNOWN_NEAR_M = 2.0
@@ -100,8 +101,12 @@ class LandmarkMap:
         self.known_pairs: set[frozenset[int]] = set()
         self.by_identity: dict[str, int] = {}
         self.deleted = self.forgotten = 0  # tentative ones, and landmarks of the graph
+        self._tentative: dict[int, Entry] = {}
         self._unseen: dict[int, Entry] = {}
         self._next = 0
+        self._index: LandmarkIndex | None = None  # of `_indexed`, as they were then
+        self._indexed: list[Entry] = []
+        self._changed: set[int] = set()  # added or extended since
 
     def __len__(self) -> int:
         return len(self.entries)
@@ -110,22 +115,40 @@ class LandmarkMap:
         """Numbers of the landmarks in the graph."""
         return [i for i, entry in self.entries.items() if entry.in_graph]
 
-    def arrays(self) -> tuple[IntArray, Array, Array, BoolArray, BoolArray]:
-        """Numbers (m,), means (m, 3), extents (m, 2), flags (m,): points, whole segments."""
-        entries = list(self.entries.values())
-        m = len(entries)
-        return (
-            np.array([e.id for e in entries], dtype=np.int64),
-            np.array([e.mean for e in entries]).reshape(m, 3),
-            np.array([e.extent for e in entries]).reshape(m, 2),
-            np.array([e.kind == "point" for e in entries], dtype=bool),
-            np.array([e.kind == "segment" for e in entries], dtype=bool),
-        )
+    def near(self, box: Array) -> list[Entry]:
+        """Landmarks by their numbers, those left out that do not touch a box (2, 2).
+
+        The box, m, is from and to; some of those given may lie outside it. All are looked through
+        anew where they moved; that is when their estimates are refreshed.
+        """
+        if self._index is None:
+            self._indexed = list(self.entries.values())
+            self._index = LandmarkIndex(*means_and_extents(self._indexed))
+        inside = self._index.touching(*box).tolist()
+        found = {self._indexed[k].id for k in inside} | self._changed
+        return [self.entries[i] for i in sorted(found) if i in self.entries]
+
+    def _note(self, entry: Entry) -> None:
+        """The index does not have this landmark, or as it was."""
+        if self._index is not None:
+            self._changed.add(entry.id)
+
+    def drop_index(self) -> None:
+        """Landmarks were moved, taken in or merged: `near` looks through all of them again."""
+        self._index = None
+        self._changed.clear()
+
+    def promote(self, entry: Entry) -> None:
+        """A tentative landmark enters the graph."""
+        entry.in_graph = True
+        self._tentative.pop(entry.id, None)
 
     def add_all(self, entries: Mapping[int, Entry]) -> None:
         """Take in landmarks with the numbers that they have."""
         self.entries |= entries
+        self._tentative |= {n: e for n, e in entries.items() if not e.in_graph}
         self.begin_at(1 + max(entries, default=-1))
+        self.drop_index()
 
     def add_known(self, entries: Mapping[int, Entry]) -> None:
         """Take in landmarks of an earlier map; their numbers are not used yet."""
@@ -166,7 +189,8 @@ class LandmarkMap:
         cov[: len(state), : len(state)] = G_z @ seen.cov @ G_z.T
         extent = np.zeros(2) if seen.extent is None else seen.extent.copy()
         entry = Entry(self._next, seen.kind, mean, cov, extent, time_ns, time_ns, seen.identity)
-        self.entries[entry.id] = entry
+        self.entries[entry.id] = self._tentative[entry.id] = entry
+        self._note(entry)
         if seen.identity is not None:
             self.by_identity[seen.identity] = entry.id
         self._next += 1
@@ -187,11 +211,13 @@ class LandmarkMap:
         grows = entry.kind == "line" or (entry.kind == "segment" and entry.sightings == 1)
         if grows and seen.extent is not None:
             entry.extend(compose(pose, seen.z), seen.extent)
+            self._note(entry)
 
     def refresh(self, backend: Backend, ids: list[int]) -> None:
         """Copy the back end's current estimates of these landmarks."""
         for i, mean in zip(ids, backend.landmark_means(ids), strict=True):
             self.entries[i].move(mean)
+        self.drop_index()
 
     def update_from(self, steps: Sequence[Step], estimate: Estimate) -> None:
         """Move to an estimate of the steps; landmarks without observations leave the map.
@@ -210,11 +236,13 @@ class LandmarkMap:
                 entry.extent = extent
                 if number in self.known:  # what was not seen now is there as well
                     entry.extend(self.known[number].mean, self.known[number].extent)
+        self.drop_index()
 
     def split(self, number: int, new: int) -> None:
         """Add landmark ``new`` as a copy of ``number``, without its identity."""
         self.entries[new] = replace(self.entries[number].copied(new), identity=None)
         self._next = max(self._next, new + 1)
+        self.drop_index()
 
     def recount(self, number: int, seen: Sequence[Association]) -> None:
         """Landmark ``number`` has these observations, those of an earlier map, and no others."""
@@ -227,6 +255,7 @@ class LandmarkMap:
             if not seen:
                 entry.extent = before.extent - between(before.mean, entry.mean)[0]
         entry.first_ns, entry.last_ns = min(times), max(times)
+        self.drop_index()
 
     def transformed(self, worlds: Mapping[int, Array]) -> "LandmarkMap":
         """The same map after the frame of each landmark was put at ``worlds[id]`` (3,)."""
@@ -239,9 +268,8 @@ class LandmarkMap:
         """Delete tentative landmarks that this robot has not seen for long, in time *and* path."""
         gone = [
             i
-            for i, e in self.entries.items()
-            if not e.in_graph
-            and robot in e.path_m
+            for i, e in self._tentative.items()
+            if robot in e.path_m
             and time_ns - e.last_ns > age_ns
             and path_m - e.path_m[robot] > age_m
         ]
@@ -260,12 +288,23 @@ class LandmarkMap:
         """Have those again that `expire_unseen` deleted, without names: a smoother knows them."""
         self.entries |= self._unseen
         self._unseen = {}
+        self.drop_index()
 
     def _delete(self, gone: Sequence[int]) -> None:
         for i in gone:
             identity = self.entries.pop(i).identity
+            self._tentative.pop(i, None)
             if identity is not None and self.by_identity.get(identity) == i:
                 del self.by_identity[identity]
+
+
+def means_and_extents(entries: Sequence[Entry]) -> tuple[Array, Array]:
+    """Means (m, 3), world frame, and extents (m, 2), m, of landmarks."""
+    m = len(entries)
+    means, extents = np.empty((m, 3)), np.empty((m, 2))
+    for k, e in enumerate(entries):
+        means[k], extents[k] = e.mean, e.extent
+    return means, extents
 
 
 def _near_each_other(entries: Sequence[Entry]) -> set[frozenset[int]]:

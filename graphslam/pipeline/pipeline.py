@@ -226,7 +226,6 @@ class Pipeline(StepRecorder):
         for robot, motion in motions.items():
             self.runs[robot].path_m += motion.length_m
         with timed(self.seconds, "association"):
-            known = set(self.associator.map.graph_ids())
             associations: tuple[Association, ...] = ()
             seen = to_state_frame(
                 sightings, [to_image[s.robot, s.time_ns] for s in sightings], len(self.sources)
@@ -253,7 +252,7 @@ class Pipeline(StepRecorder):
                 associations += self.associate_image(image, own, state_ns[image[0].robot], motions)
             self.record_covariances()
         associations = self.moved_to_states(associations, offers)
-        self.add_step(Step(step_ns, {}, motions, inflate_repeated(associations)), known, offers)
+        self.add_step(Step(step_ns, {}, motions, inflate_repeated(associations)), offers)
 
     def moved_to_states(
         self, associations: Sequence[Association], offers: Sequence[Association]
@@ -402,7 +401,6 @@ class Pipeline(StepRecorder):
         if motion is not None:
             run.path_m += motion.length_m
         with timed(self.seconds, "association"):
-            known = set(self.associator.map.graph_ids())
             associations: tuple[Association, ...] = ()
             offers = robot_associations(robot, state_ns, seen)
             if seen:
@@ -423,7 +421,7 @@ class Pipeline(StepRecorder):
             self.record_covariances()
         if not (motions or associations or closures):
             return
-        self.add_step(Step(time_ns, {}, motions, associations, closures), known, offers)
+        self.add_step(Step(time_ns, {}, motions, associations, closures), offers)
         for message in event:
             if isinstance(message, Scan):
                 if run.since_keyframe is not None:

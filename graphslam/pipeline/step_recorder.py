@@ -105,7 +105,7 @@ class StepRecorder(LogPass):
             if motion is not None and keyframes.has_moved(run, run.state_ns, start_ns):
                 run.path_m += motion.length_m
                 self.record_covariances()
-                self.add_step(Step(start_ns, {}, {robot: motion}), set())
+                self.add_step(Step(start_ns, {}, {robot: motion}))
 
     def motion_since_state(self, robot: str, time_ns: int) -> Motion | None:
         """Motion since the robot's last state; None when it is at that very time."""
@@ -114,17 +114,17 @@ class StepRecorder(LogPass):
             return None
         return run.track.motion(run.state_ns, time_ns)
 
-    def add_step(self, step: Step, known: set[int], offers: Sequence[Association] = ()) -> None:
+    def add_step(self, step: Step, offers: Sequence[Association] = ()) -> None:
         """Give a step to the back end and learn from it.
 
         Args:
             step: what enters.
-            known: landmarks that were there before it.
             offers: what the sightings of robots in it could be, see `LogPass`.
         """
         if not (step.motions or step.associations or step.closures):
             return
         step = replace(step, deleted=self.associator.take_deleted())
+        admitted = self.associator.take_admitted()
         with timed(self.seconds, "back end"):
             self.backend.add(step)
             self.associator.settle()
@@ -133,7 +133,7 @@ class StepRecorder(LogPass):
             self.steps.append(step)
             poses = {name: self.backend.state_mean(name) for name in step.motions}
             if self.config.odometry.calibrate:
-                self.learn(step, poses, known)
+                self.learn(step, poses, admitted)
             if len(self.steps) >= self.next_batch_step:
                 self.next_batch_step = round(self.batch_step_growth * len(self.steps))
                 self.batch_is_due = True
@@ -186,20 +186,23 @@ class StepRecorder(LogPass):
             track.calibration = calibrator.restart(track.prior, track.calibration)
         return found
 
-    def learn(self, step: Step, poses: Mapping[str, Array], known: set[int]) -> None:
+    def learn(self, step: Step, poses: Mapping[str, Array], admitted: set[int]) -> None:
         """Improve robots' calibration from a step.
 
         Args:
             step: as the back end has it.
             poses: (3,) estimates of the states that it made.
-            known: landmarks that were there before it.
+            admitted: landmarks that were not there before it.
         """
         seen = [
             a
             for a in step.associations
-            if a.robot in poses and a.time_ns == step.time_ns and a.target in known
+            if a.robot in poses
+            and a.time_ns == step.time_ns
+            and isinstance(a.target, int)
+            and a.target not in admitted
         ]
-        landmarks = self.backend.landmark_means([a.target for a in seen if a.target in known])
+        landmarks = self.backend.landmark_means([int(a.target) for a in seen])
         observed = observed_information(seen, poses, landmarks)
         for robot, pose in poses.items():
             turn = rotation3(-float(self.runs[robot].latest_pose[2]))

@@ -209,7 +209,7 @@ class SightingPass(Pipeline):
         if number is None:
             # where it is follows when the steps are solved
             entry = landmarks.add(o, np.zeros(3), run.state_ns)
-            entry.in_graph = True
+            landmarks.promote(entry)
         else:
             entry = landmarks.entries[number]
         if entry.kind != o.kind:
