@@ -27,6 +27,7 @@ from graphslam.estimation.line_residuals import LineResiduals
 from graphslam.estimation.motion_arrays import increments_of, linear_motions, moved_by
 from graphslam.estimation.optimisation import (
     CONVERGED_ERROR_ROUGH,
+    joint_marginal_by_qr,
     marginals_of,
     reweighted,
     root_of,
@@ -414,12 +415,17 @@ class CalibrationGraph:
 
     def _joint_covariance(self, keys: Sequence[int]) -> Array:
         """Joint covariance (D, D) of variables at the last solution, in their own axes."""
+        if self._marginals is None:
+            self._relinearise()
+        graph, values = self._builder.graph, self._values
         try:
-            if self._marginals is None:
-                self._relinearise()
-                self._marginals = gtsam.Marginals(self._builder.graph, self._values)
+            self._marginals = self._marginals or gtsam.Marginals(graph, values)
             return np.asarray(self._marginals.jointMarginalCovariance(list(keys)).fullMatrix())
-        except RuntimeError as error:
+        except RuntimeError as failed:
+            error = failed
+        try:
+            return joint_marginal_by_qr(graph, values, keys)
+        except RuntimeError:
             raise self._builder.explain(error) from error
 
 

@@ -274,3 +274,30 @@ def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int])
     if len(keys) == 1:
         return np.asarray(tree.marginalCovariance(keys[0]))
     return np.asarray(tree.jointMarginalCovariance(keys).fullMatrix())
+
+
+def joint_marginal_by_qr(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Sequence[int]
+) -> Array:
+    """Joint marginal covariance (D, D) of a few variables in this order, where Cholesky fails.
+
+    They are eliminated last: their own conditionals are the root of their information.
+
+    Raises:
+        RuntimeError: it is indeterminate.
+    """
+    linear = graph.linearize(values)
+    last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, list(keys), True)
+    every = linear.eliminateSequential(last, gtsam.EliminateQR)
+    own = gtsam.GaussianBayesNet()
+    for n in range(every.size() - len(keys), every.size()):
+        own.push_back(every.at(n))
+    R, _ = own.matrix()
+    try:
+        inverse = np.linalg.inv(R)
+    except np.linalg.LinAlgError as error:
+        raise RuntimeError("indeterminate") from error
+    # QR does not fail on an indeterminate graph, its root is not finite
+    if not np.isfinite(inverse).all():
+        raise RuntimeError("indeterminate")
+    return np.asarray(inverse @ inverse.T)
