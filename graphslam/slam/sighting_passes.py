@@ -24,6 +24,9 @@ from graphslam.sighting_smoothing.sighting_solution import (
 from graphslam.slam.initialisation import with_identities
 from graphslam.slam.passes import decide_next_pass, find_clocks, find_swapped_names
 
+#: ms that a sighting of a robot takes for the clocks by the paths
+CLOCK_MS = 0.05
+
 
 def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass | None:
     """`run_passes` without an incremental estimate; None for logs that need one.
@@ -65,7 +68,10 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
                 replayed.cancel()
                 return None
             # all that is finer depends on the clocks; paths need the calibration
-            asked = Future(partial(clocks_from_paths, one.seen_robots, one.tracks, config))
+            seen = one.seen_robots
+            asked = Future(
+                partial(clocks_from_paths, seen, one.tracks, config), about_ms=CLOCK_MS * len(seen)
+            )
             rough = with_gated_robots(one, rough, made)
             clocks = asked.result()
             if clocks and not known.clocks:
