@@ -6,7 +6,7 @@ is estimated jointly, and its uncertainty is in every covariance.
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -326,8 +326,10 @@ class CalibrationGraph:
             landmarks[number] = turn @ columns[first : first + dim]
         return MountCovariances(robots, cov, states, landmarks)
 
-    def posterior(self) -> Posterior:
+    def posterior(self, over_spans: Collection[str] = ()) -> Posterior:
         """The last solution with the covariances that its residuals need.
+
+        ``over_spans``: robots of which also motions over spans are wanted, see `stated_robots`.
 
         Raises:
             EstimationError: it is indeterminate.
@@ -335,9 +337,9 @@ class CalibrationGraph:
         builder = self._builder
         self._relinearise()
         free = {robot: (self._keys[robot], use) for robot, use in self._free.items() if len(use)}
-        pairs = posterior_pairs(builder, free)
+        pairs = posterior_pairs(builder, free, over_spans)
         try:
-            blocks = marginals_of(builder.graph, self._values, pairs)
+            blocks = marginals_of(builder.graph, self._values, *pairs)
         except RuntimeError as error:
             raise builder.explain(error) from error
         return Posterior(self._steps, self._made, builder, self._values, blocks, free)

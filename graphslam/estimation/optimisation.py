@@ -6,7 +6,7 @@ graph indeterminate. QR factorises the factors themselves, at about twice the co
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 
 import gtsam
 import numpy as np
@@ -222,14 +222,16 @@ def _can_fall(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, share: fl
 def marginals_of(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
-    pairs: Iterable[tuple[int, ...]] = (),
+    pairs: Collection[tuple[int, ...]] = (),
+    apart: Collection[tuple[int, ...]] = (),
     *,
     keep_rows: bool = False,
     use_qr: bool = False,
 ) -> CovarianceBlocks:
-    """Covariances of all variables and of pairs of poses: by Cholesky, or by QR where that fails.
+    """Covariances of all variables and of some together: by Cholesky, or by QR where that fails.
 
-    Errors are in body frames. ``keep_rows``: see `covariance_blocks`; ``use_qr``: by QR at once.
+    Errors are in body frames. ``pairs``, ``apart``, ``keep_rows``: see `covariance_blocks`;
+    ``use_qr``: by QR at once.
 
     Raises:
         RuntimeError: one is indeterminate.
@@ -237,11 +239,11 @@ def marginals_of(
     error = RuntimeError("")
     if not use_qr:
         try:
-            return covariance_blocks(graph.linearize(values), pairs, keep_rows=keep_rows)
+            return covariance_blocks(graph.linearize(values), pairs, apart, keep_rows=keep_rows)
         except RuntimeError as failed:
             error = failed
     linear = graph.linearize(values)
-    blocks = covariance_blocks(linear, pairs, use_qr=True, keep_rows=keep_rows)
+    blocks = covariance_blocks(linear, pairs, apart, use_qr=True, keep_rows=keep_rows)
     # QR does not fail on an indeterminate graph, its covariances are not finite
     if not all(np.isfinite(cov).all() for cov in blocks.marginals.values()):
         raise error

@@ -53,15 +53,18 @@ class CovarianceBlocks:
 def covariance_blocks(
     graph: gtsam.GaussianFactorGraph,
     pairs: Iterable[tuple[int, ...]] = (),
+    apart: Iterable[tuple[int, ...]] = (),
     *,
     use_qr: bool = False,
     keep_rows: bool = False,
 ) -> CovarianceBlocks:
-    """Covariances of all variables of a linear graph, and joint ones of ``pairs``.
+    """Covariances of all variables of a linear graph, joint ones of ``pairs`` and of ``apart``.
 
     Args:
-        graph: factors; it gains empty ones for those ``pairs`` that no factor connects.
-        pairs: keys of two different poses each, and of others to which factors connect both.
+        graph: factors; it gains empty ones for ``apart``.
+        pairs: keys of variables that are in one factor.
+        apart: keys of two different poses each, whether a factor connects them or not, and of
+            others to which factors connect both.
         use_qr: eliminate by QR, slower than Cholesky, but precise where information spans many
             orders of magnitude.
         keep_rows: whether to return the root too.
@@ -69,14 +72,10 @@ def covariance_blocks(
     Raises:
         RuntimeError: the graph is indeterminate (by QR: covariances are not finite instead).
     """
-    wanted = set(pairs)
-    if wanted:
-        linked = {tuple(graph.at(n).keys()) for n in range(graph.size())}
-        others = sorted(wanted - linked)  # most are in the order of a factor's keys
-        connected = set(map(frozenset, linked)) if others else set()
-        for pair in others:
-            if frozenset(pair) not in connected:
-                graph.add(_empty_factor(*pair[:2]))
+    wanted, others = set(pairs), sorted(set(apart))
+    for pair in others:
+        graph.add(_empty_factor(*pair[:2]))
+    wanted.update(others)
     cliques, clique_of = _eliminated(graph, use_qr)
     pairs_in: dict[int, list[tuple[int, ...]]] = defaultdict(list)
     for pair in wanted:

@@ -19,12 +19,12 @@ def of_mount(
         mount: pose (..., 3) of the frame in the body.
         by_latency: (..., 3) derivative of the body's motion, /s.
     """
-    lever = lever_to(delta, mount)
     moved, d_mount = mounted_motion(delta, mount)
-    parts = [lever @ d_cal, d_mount]
-    if by_latency is not None:
-        parts.append(lever @ by_latency[..., None])
-    return moved, lever @ cov @ lever.mT, np.concatenate(parts, axis=-1)
+    late = [] if by_latency is None else [by_latency[..., None]]
+    if mount.any():  # else there is no lever, as with most sensors
+        lever = lever_to(delta, mount)
+        cov, d_cal, late = lever @ cov @ lever.mT, lever @ d_cal, [lever @ d for d in late]
+    return moved, cov, np.concatenate([d_cal, d_mount, *late], axis=-1)
 
 
 def lever_to(delta: Array, mount: Array) -> Array:

@@ -21,11 +21,12 @@ from graphslam.estimation.motion_noise import (
     NoiseFit,
     fit_track_noise,
     measured_motion_noise,
+    stated_robots,
 )
 from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
-from graphslam.odometry.noise_estimation import is_stated, with_fit_uncertainty, without_floors
+from graphslam.odometry.noise_estimation import with_fit_uncertainty, without_floors
 from graphslam.odometry.preintegration import Track
 from graphslam.sighting_smoothing.sensor_latency import hold_insignificant_latency
 from graphslam.sighting_smoothing.sighting_states import (
@@ -129,7 +130,7 @@ def _estimated(
     one = np.ones(2)
     sources = {(a.robot, a.model) for s in steps for a in s.associations if len(a.z) == 2}
     noise = {source: ObservationNoise(one, one, config.robust.scale) for source in sources}
-    stated = {name for name, track in tracks.items() if is_stated(track)}
+    stated = stated_robots(tracks)
     for name in stated:
         tracks[name].config = without_floors(tracks[name].config)
     measured: dict[Source, Array] = {}
@@ -143,7 +144,7 @@ def _estimated(
             made, estimate, priors, initial, config.robust, noise, calibrated=True
         )
         estimate, calibrations = graph.solve(CONVERGED_ERROR)
-        posterior = graph.posterior()
+        posterior = graph.posterior(stated)
         new = _sighting_noise(posterior, noise)
         change = _largest_change(noise, new)
         noise = new
