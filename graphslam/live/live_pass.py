@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2  # noqa: F401 (scans need it; imported then, it delays one)
 import numpy as np
 import scipy.optimize  # noqa: F401 (association needs it: imported then, it delays a scan by 0.1 s)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, compose_jacobians, rotation3
 from graphslam.core.motion_models import mounted_motion
 
@@ -30,3 +31,18 @@ def of_mount(
 def lever_to(delta: Array, mount: Array) -> Array:
     """Errors of a body's motion, as they move a frame mounted on it: (..., 3, 3), its lever arm."""
     return np.asarray(rotation3(-mount[..., 2]) @ compose_jacobians(delta, mount)[0])
+
+
+def calibration_covs(d_cal: Array, known: Array, which: IntArray) -> Array:
+    """Covariances (m, 3, 3) of motions by the errors of their calibrations.
+
+    Args:
+        d_cal: (m, 3, p) derivatives of the motions.
+        known: (k, p, p) covariances of the calibrations.
+        which: (m,) the calibration of each motion.
+    """
+    if len(known) == 1:  # one product of all rows, instead of many small ones
+        weighed = (d_cal.reshape(-1, d_cal.shape[2]) @ known[0]).reshape(d_cal.shape)
+    else:
+        weighed = d_cal @ known[which]
+    return np.asarray(weighed @ d_cal.mT)

@@ -63,8 +63,7 @@ def receive_log(reading: Reading, config: Config) -> LogSet:
     log = reading.receive()
     assert isinstance(log, LogSet)
     if any(map(log.has_scans, log.robots)):
-        # matching and association need them, and they are slow to import: scans are being read
-        import cv2  # noqa: F401, PLC0415
+        # association needs it, and it is slow to import: the first scans are still being read
         import scipy.optimize  # noqa: F401, PLC0415
 
     if not is_scan_log(log, config):
