@@ -107,7 +107,7 @@ class Posterior:
             self._values([pair[end] for pair in pairs], dim)
             for end, dim in enumerate((3, model.dim))
         )
-        z, cov = (np.array([getattr(a, name) for *_, a in seen]) for name in ("z", "cov"))
+        z, cov = self.builder.polar[source]
         variance = np.diagonal(cov, axis1=1, axis2=2)
         if source in self.builder.noise:
             variance = variance * self.builder.noise[source].white

@@ -7,12 +7,12 @@ noise that is new in every sighting, and errors that sightings of one target sha
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Sighting, Start, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph
 from graphslam.estimation.log_noise import MOTION, LogNoise, has_state_at_every_sighting, is_white
@@ -206,10 +206,9 @@ def _is_measured(posterior: Posterior, source: Source) -> Array:
     sees bearings alone writes some constant as range. Its residuals are far below such a sigma, as
     the constant has about the right size, and tell nothing of a measurement.
     """
-    seen = [a for *_, a in posterior.builder.bearings_and_ranges[source]]
-    sigmas = np.sqrt(np.diagonal([a.cov for a in seen], axis1=1, axis2=2))
-    ranges = np.array([a.z[1] for a in seen])
-    return np.asarray(np.median(sigmas, axis=0) < [UNKNOWN_BEARING_RAD, np.median(ranges)])
+    z, cov = posterior.builder.polar[source]
+    sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    return np.asarray(np.median(sigmas, axis=0) < [UNKNOWN_BEARING_RAD, np.median(z[:, 1])])
 
 
 def _cautious(found: ObservationNoise, config: Config) -> ObservationNoise:
