@@ -9,7 +9,7 @@ def non_negative_least_squares(A: Array, b: Array) -> Array:
     """The x ≥ 0 (n,) for which |A x - b| is least, with A (m, n) and b (m,).
 
     By the active set of C. L. Lawson and R. J. Hanson, Solving Least Squares Problems, 1974,
-    section 23.3. `scipy.optimize.nnls` is the same; importing it takes 0.05 s and 10 MB.
+    section 23.3. SciPy has the same; importing that takes 0.05 s and 10 MB.
     """
     n = A.shape[1]
     x, free = np.zeros(n), np.zeros(n, dtype=bool)

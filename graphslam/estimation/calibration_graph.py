@@ -131,7 +131,9 @@ class CalibrationGraph:
         """
         self._builder = builder = RecordedGraph(kernel, noise)
         self._values, self._priors = gtsam.Values(), priors
-        self._marginals: gtsam.Marginals | None = None  # at the last solution
+        # at the last solution, as is the error of the graph that was solved
+        self._marginals: gtsam.Marginals | None = None
+        self._error = 0.0
         self.line_noise: Mapping[str, Array] = {}
         self._steps = steps
         self._made: Mapping[str, Increments] = increments_of(steps)  # the motions in the graph
@@ -209,16 +211,17 @@ class CalibrationGraph:
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setRelativeErrorTol(converged)
         parameters.setMaxIterations(50)
-        values, is_done = self._values, False
+        values, error, is_done = self._values, 0.0, False
         try:
             # rough solutions begin far off
             if builder.kernel.kernel != "none" and converged < CONVERGED_ERROR_ROUGH:
-                values, is_done = reweighted(graph, values, converged)
+                values, error, is_done = reweighted(graph, values, converged)
             if not is_done:
-                values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        except RuntimeError as error:
-            raise builder.explain(error) from error
-        self._values, self._marginals = values, None
+                optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+                values, error = optimizer.optimize(), optimizer.error()
+        except RuntimeError as failed:
+            raise builder.explain(failed) from failed
+        self._values, self._error, self._marginals = values, error, None
 
     def solution(
         self,
@@ -243,9 +246,10 @@ class CalibrationGraph:
         """
         builder, values, found = self._builder, self._values, NO_COVARIANCES
         weighed: list[WeighedWalls] = []
+        half_error = self._error
         if marginals:
             self._relinearise()
-        half_error = float(builder.graph.error(values))
+            half_error = float(builder.graph.error(values))
         if marginals and bias_m is not None and builder.observes_walls:
             self.line_noise = fit_line_noise(self.line_residuals())
             weighed = builder.weigh_walls(values, self.line_noise)

@@ -228,7 +228,8 @@ def fit_motion_noise(tracks: Mapping[str, Track], solutions: Iterable[Posterior]
     Args:
         tracks: odometry of the robots.
         solutions: each made when it is asked for, by the noise that the tracks have then, with the
-            spans of `stated_robots`. More than one come nearer to noise that is far from that of the first.
+            spans of `stated_robots`. More than one come nearer to noise that is far from that of
+            the first.
     """
     stated = stated_robots(tracks)
     measured: dict[tuple[str, str], Array] = {}

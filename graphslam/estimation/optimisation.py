@@ -84,7 +84,7 @@ def optimise(
     if converged is None:
         converged = CONVERGED_ERROR if kernel.kernel == "none" else CONVERGED_ERROR_ROBUST
     if kernel.kernel != "none" and not use_qr:
-        values, is_done = reweighted(graph, values, converged)
+        values, _, is_done = reweighted(graph, values, converged)
         if is_done:
             return values
     parameters = gtsam.LevenbergMarquardtParams()
@@ -108,7 +108,7 @@ def optimise(
 
 def reweighted(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, converged: float
-) -> tuple[gtsam.Values, bool]:
+) -> tuple[gtsam.Values, float, bool]:
     """Gauss-Newton under kernels, until the relative decrease of the error is small.
 
     Weights of a kernel converge linearly: near the end each step is a constant part of the one
@@ -120,8 +120,8 @@ def reweighted(
     directions of a long path, which are those that Cholesky loses.
 
     Returns:
-        The best values, and whether they have converged: not where half a step raises the error,
-        or the graph is indeterminate. Damping is needed there.
+        The best values, the error there, and whether they have converged: not where half a step
+        raises the error, or the graph is indeterminate. Damping is needed there.
     """
     ordering: gtsam.Ordering | None = None
     error, before, share = graph.error(values), None, math.inf
@@ -132,7 +132,7 @@ def reweighted(
         try:
             step = _undamped(linear, ordering)
         except RuntimeError:
-            return values, False
+            return values, error, False
         factor = 1.0
         if before is not None and share < NEAR:
             factor = _extrapolation(before, step)
@@ -150,13 +150,13 @@ def reweighted(
             moved = values.retract(step.scale(0.5))
             now = graph.error(moved)
             if not now <= error:
-                return values, False
+                return values, error, False
         before = step if factor == 1.0 and is_straight else None
         decrease, error, values = error - now, now, moved
         share = decrease / error if error > 0.0 else 0.0
         if share < converged or decrease < CONVERGED_ABSOLUTE:
-            return values, True
-    return values, True
+            return values, error, True
+    return values, error, True
 
 
 def _undamped(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:

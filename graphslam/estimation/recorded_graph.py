@@ -65,8 +65,8 @@ class RecordedGraph(BatchGraph):
     ``motions``: index in the graph, robot, and the keys of the states before and after.
     ``bearings_and_ranges``: by source, keys of the state and of the target of each, and its
     association, and likewise ``segments``; ``polar``: their bearings and ranges (n, 2) and the
-    covariances (n, 2, 2), as stated; ``shared_errors`` by source, where its ``noise`` has
-    such a part.
+    covariances (n, 2, 2), as stated; ``shared_errors`` by source, where its ``noise`` has such a
+    part.
     """
 
     def __init__(

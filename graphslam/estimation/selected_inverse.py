@@ -179,14 +179,15 @@ class _Clique:
     def invert(self, above: "_Clique | None") -> Array:
         """Covariance of the own variables and then the separator; kept while it is needed."""
         inverse, singular = dtrtri(self.conditional.R())
-        own = len(inverse)
+        inverse, own = np.asarray(inverse), len(inverse)
         if singular:
             inverse = np.full((own, own), np.nan)
         if above is None:
-            cov = inverse @ inverse.T
+            cov = np.asarray(inverse @ inverse.T)
         else:
             assert above._cov is not None
-            starts, sizes, held = above.starts, self.sizes, []
+            starts, sizes = above.starts, self.sizes
+            held: list[int] = []
             for key in self.separator:
                 held += range(starts[key], starts[key] + sizes[key])
             which = np.array(held)

@@ -195,7 +195,9 @@ def variances_by_rate(track: Track, start_ns: IntArray, end_ns: IntArray) -> Arr
         times, at = np.unique(np.concatenate([start, end]), return_inverse=True)
         sums, _ = path_sums([track], [times], by_rate=True)
         motions = sums.motions_between(*np.split(at, 2))
-        covs = transformed(motions.cov, lever_to(motions.delta, mount))
+        covs = motions.cov
+        if mount.any():
+            covs = transformed(covs, lever_to(motions.delta, mount))
         found.append(np.diagonal(covs, axis1=2, axis2=3).mT)
     return np.concatenate(found)
 

@@ -47,8 +47,8 @@ def mixed_graph(seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_blocks_are_those_of_the_inverse(seed, use_qr):
     """Of the dense inverse, for every variable, for pairs with a factor in either order, and for
-    pairs that need none: one of these is in two components, whose cross covariance is zero. Also for pairs
-    together with what all motions share."""
+    pairs that need none: one of these is in two components, whose cross covariance is zero. Also
+    for pairs together with what all motions share."""
     graph, linked = mixed_graph(seed)
     pairs = [*linked, (3, 17), (POSES - 1, POSES // 2), (59, 0), (4, 5, 5000), (20, 6, 5000)]
     keys = sorted(graph.keyVector())
