@@ -42,7 +42,8 @@ def calibration_covs(d_cal: Array, known: Array, which: IntArray) -> Array:
         which: (m,) the calibration of each motion.
     """
     if len(known) == 1:  # one product of all rows, instead of many small ones
-        weighed = (d_cal.reshape(-1, d_cal.shape[2]) @ known[0]).reshape(d_cal.shape)
+        rows = d_cal.reshape(3 * len(d_cal), d_cal.shape[2])
+        weighed = (rows @ known[0]).reshape(d_cal.shape)
     else:
         weighed = d_cal @ known[which]
     return np.asarray(weighed @ d_cal.mT)
