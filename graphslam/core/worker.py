@@ -29,9 +29,9 @@ THREADS = Path("/proc/self/task")
 MOST_ROOM = Path("/proc/sys/fs/pipe-max-size")
 #: items sent at once
 BATCH = 256
-#: ms of CPU time that a second process takes beside its work, in both: tables of pages, and copies
-#: of those that either writes (35 at 200 MB). What takes less ends no sooner for it
-FORK_MS = 40.0
+#: ms of work for which a second process is worth it: twice the CPU time that it takes beside, in
+#: both, for tables of pages and for copies of those that either writes (35 to 40 at 200 MB)
+FORK_MS = 80.0
 #: how nice a process is whose result is not waited for soon: it gets a tenth of a shared core
 LOW_PRIORITY = 10
 

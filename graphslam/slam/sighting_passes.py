@@ -24,8 +24,8 @@ from graphslam.sighting_smoothing.sighting_solution import (
 from graphslam.slam.initialisation import with_identities
 from graphslam.slam.passes import decide_next_pass, find_clocks, find_swapped_names
 
-#: ms that a sighting of a robot takes for the clocks by the paths
-CLOCK_MS = 0.05
+#: ms that a sighting of a robot takes for the clocks: by the paths, and in the whole graph
+PATH_CLOCK_MS, CLOCK_MS = 0.05, 0.09
 
 
 def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass | None:
@@ -70,7 +70,7 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
             # all that is finer depends on the clocks; paths need the calibration
             seen = one.seen_robots
             asked = Future(
-                partial(clocks_from_paths, seen, one.tracks, config), about_ms=CLOCK_MS * len(seen)
+                partial(clocks_from_paths, seen, one.tracks, config), about_ms=PATH_CLOCK_MS * len(seen)
             )
             rough = with_gated_robots(one, rough, made)
             clocks = asked.result()
@@ -83,7 +83,9 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
             for run in one.started.values():
                 run.is_calibrated = True
             # a log is seldom read again, so the result does not wait to know
-            clocks_asked = Future(partial(find_clocks, one, estimate, coarsely=False))
+            clocks_asked = Future(
+                partial(find_clocks, one, estimate, coarsely=False), about_ms=CLOCK_MS * len(seen)
+            )
             swapped = find_swapped_names(one, estimate)
             estimate = settled(one.steps, estimate, one.kernel)
             found = clocks_asked.result()

@@ -249,8 +249,8 @@ def test_smooth_writes_the_same_with_and_without(tmp_path):
 
 
 def test_small_work_does_not_fork():
-    """A second process takes 40 ms of CPU time beside its work: what is known to take less runs
-    here, what is known to take more or not known at all does not."""
+    """A second process takes 40 ms of CPU time beside its work: what is known to take less than
+    twice that runs here, what takes more or is not known does not."""
     lines = printed("""
         def own(_=None):
             return os.getpid() == here
