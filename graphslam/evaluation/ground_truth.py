@@ -1,6 +1,5 @@
 """Ground truth for an evaluation: from the logs of a run, other logs, or TUM files."""
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,6 +21,8 @@ from graphslam.results.file_formats import read_trajectory
 from graphslam.results.folder import SavedResult
 from graphslam.verdict.verdict import with_truth
 
+#: ms that a message of a log takes where the truth among them is read, at most if it is small
+MESSAGE_MS = 0.003
 _NO_TRUTH = "holds no true poses or landmarks; give"
 
 
@@ -39,7 +40,7 @@ def truth_of_logs(log: LogSet) -> GroundTruth:
 
 def truth_later(log: LogSet) -> Future[GroundTruth]:
     """`truth_of_logs`, from the second process if there is any."""
-    about_ms = math.inf if has_truth(log) else 0.0
+    about_ms = MESSAGE_MS * log.count() if has_truth(log) else 0.0
     return Future(partial(truth_of_logs, log), urgent=False, about_ms=about_ms)
 
 
