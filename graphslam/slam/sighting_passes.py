@@ -70,7 +70,8 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
             # all that is finer depends on the clocks; paths need the calibration
             seen = one.seen_robots
             asked = Future(
-                partial(clocks_from_paths, seen, one.tracks, config), about_ms=PATH_CLOCK_MS * len(seen)
+                partial(clocks_from_paths, seen, one.tracks, config),
+                about_ms=PATH_CLOCK_MS * len(seen),
             )
             rough = with_gated_robots(one, rough, made)
             clocks = asked.result()
