@@ -202,14 +202,14 @@ def smooth(
         from graphslam.slam.smooth import smooth
 
         if output is not None:  # for the processes that read the truth and draw the report
-            from graphslam.evaluation.ground_truth import errors_of_run, truth_of_logs
+            from graphslam.evaluation.ground_truth import errors_of_run, truth_later
             from graphslam.results.report import render
 
         earlier = known_map_of(settled)
         log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
 
         with checkpoint(output, log, settled, earlier, resume=resume) as kept:
-            truth = None if output is None else Future(partial(truth_of_logs, log), urgent=False)
+            truth = None if output is None else truth_later(log)
             result = smooth(log, settled, of_all(log, progress), None, ahead, kept, earlier)
             if output is not None and truth is not None:
                 announce("report")

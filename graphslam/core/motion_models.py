@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphslam.core.config import OdometryConfig, RobotConfig
-from graphslam.core.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3
+from graphslam.core.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3, wrap
 
 #: a calibration parameter whose prior sigma is smaller, in any unit, is held
 HELD_SIGMA = 1e-6
@@ -236,8 +236,13 @@ def mounted_motion(delta: Array, mount: Array) -> tuple[Array, Array]:
         ``inverse(mount) delta mount`` (..., 3), and its derivative (..., 3, 3) by the mount.
         Turning in place shows the mount's position, driving straight its direction.
     """
-    moved = compose(inverse(mount), compose(delta, mount))
-    D = rotation3(-mount[..., 2]) @ (rotation3(delta[..., 2]) - np.eye(3))
+    D = rotation3(delta[..., 2]) - np.eye(3)
+    if mount.any():
+        moved = compose(inverse(mount), compose(delta, mount))
+        D = rotation3(-mount[..., 2]) @ D
+    else:  # as most are
+        moved = delta.copy()
+        moved[..., 2] = wrap(delta[..., 2])
     D[..., 0, 2], D[..., 1, 2] = moved[..., 1], -moved[..., 0]
     return moved, D
 

@@ -6,7 +6,7 @@ is estimated jointly, and its uncertainty is in every covariance.
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -132,7 +132,9 @@ class CalibrationGraph:
         """
         self._builder = builder = RecordedGraph(kernel, noise)
         self._values, self._priors = gtsam.Values(), priors
-        self._marginals: gtsam.Marginals | None = None  # at the last solution
+        # at the last solution, as is the error of the graph that was solved
+        self._marginals: gtsam.Marginals | None = None
+        self._error = 0.0
         self.line_noise: Mapping[str, Array] = {}
         self._steps = steps
         self._made: Mapping[str, Increments] = increments_of(steps)  # the motions in the graph
@@ -210,16 +212,17 @@ class CalibrationGraph:
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setRelativeErrorTol(converged)
         parameters.setMaxIterations(50)
-        values, is_done = self._values, False
+        values, error, is_done = self._values, 0.0, False
         try:
             # rough solutions begin far off
             if builder.kernel.kernel != "none" and converged < CONVERGED_ERROR_ROUGH:
-                values, is_done = reweighted(graph, values, converged)
+                values, error, is_done = reweighted(graph, values, converged)
             if not is_done:
-                values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        except RuntimeError as error:
-            raise builder.explain(error) from error
-        self._values, self._marginals = values, None
+                optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+                values, error = optimizer.optimize(), optimizer.error()
+        except RuntimeError as failed:
+            raise builder.explain(failed) from failed
+        self._values, self._error, self._marginals = values, error, None
 
     def solution(
         self,
@@ -244,9 +247,10 @@ class CalibrationGraph:
         """
         builder, values, found = self._builder, self._values, NO_COVARIANCES
         weighed: list[WeighedWalls] = []
+        half_error = self._error
         if marginals:
             self._relinearise()
-        half_error = float(builder.graph.error(values))
+            half_error = float(builder.graph.error(values))
         if marginals and bias_m is not None and builder.observes_walls:
             self.line_noise = fit_line_noise(self.line_residuals())
             weighed = builder.weigh_walls(values, self.line_noise)
@@ -327,8 +331,10 @@ class CalibrationGraph:
             landmarks[number] = turn @ columns[first : first + dim]
         return MountCovariances(robots, cov, states, landmarks)
 
-    def posterior(self) -> Posterior:
+    def posterior(self, over_spans: Collection[str] = ()) -> Posterior:
         """The last solution with the covariances that its residuals need.
+
+        ``over_spans``: robots of which also motions over spans are wanted, see `stated_robots`.
 
         Raises:
             EstimationError: it is indeterminate.
@@ -336,9 +342,9 @@ class CalibrationGraph:
         builder = self._builder
         self._relinearise()
         free = {robot: (self._keys[robot], use) for robot, use in self._free.items() if len(use)}
-        pairs = posterior_pairs(builder, free)
+        pairs = posterior_pairs(builder, free, over_spans)
         try:
-            blocks = marginals_of(builder.graph, self._values, pairs)
+            blocks = marginals_of(builder.graph, self._values, *pairs)
         except RuntimeError as error:
             raise builder.explain(error) from error
         return Posterior(self._steps, self._made, builder, self._values, blocks, free)

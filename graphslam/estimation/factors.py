@@ -331,7 +331,12 @@ def bearing_range_factors(
     ``model`` is of `BEARING_RANGE`; ``z`` (n, 2) are the measurements, ``cov`` (n, 2, 2) their
     covariances, all positive definite.
     """
-    noises = _all_robust(map(gtsam.noiseModel.Gaussian.Covariance, cov), kernel)
+    # many sensors state one covariance for all: equal ones share a noise model
+    first: dict[bytes, int] = {}
+    like = [first.setdefault(one.tobytes(), k) for k, one in enumerate(cov)]
+    several = list(first.values())
+    made = _all_robust(map(gtsam.noiseModel.Gaussian.Covariance, cov[several]), kernel)
+    noises = map(dict(zip(several, made, strict=True)).__getitem__, like)
     bearings = map(gtsam.Rot2, z[:, 0].tolist())
     return list(map(BEARING_RANGE[model], keys, targets, bearings, z[:, 1].tolist(), noises))
 

@@ -217,15 +217,21 @@ def measured_motion_noise(track: Track, robot: str, posterior: Posterior) -> Arr
     return found.variance_factor() * np.median(found.variance / stated, axis=0)
 
 
+def stated_robots(tracks: Mapping[str, Track]) -> set[str]:
+    """Robots whose noise is stated: it is measured over spans (`measured_motion_noise`)."""
+    return {robot for robot, track in tracks.items() if is_stated(track)}
+
+
 def fit_motion_noise(tracks: Mapping[str, Track], solutions: Iterable[Posterior]) -> LogNoise:
     """`fit_track_noise` of all tracks; of those whose noise is stated what is measured.
 
     Args:
         tracks: odometry of the robots.
-        solutions: each made when it is asked for, by the noise that the tracks have then. More than
-            one come nearer to noise that is far from that of the first.
+        solutions: each made when it is asked for, by the noise that the tracks have then, with the
+            spans of `stated_robots`. More than one come nearer to noise that is far from that of
+            the first.
     """
-    stated = {robot for robot, track in tracks.items() if is_stated(track)}
+    stated = stated_robots(tracks)
     measured: dict[tuple[str, str], Array] = {}
     fits: dict[str, NoiseFit] = {}
     for posterior in solutions:

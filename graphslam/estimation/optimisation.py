@@ -6,7 +6,7 @@ graph indeterminate. QR factorises the factors themselves, at about twice the co
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 
 import gtsam
 import numpy as np
@@ -84,7 +84,7 @@ def optimise(
     if converged is None:
         converged = CONVERGED_ERROR if kernel.kernel == "none" else CONVERGED_ERROR_ROBUST
     if kernel.kernel != "none" and not use_qr:
-        values, is_done = reweighted(graph, values, converged)
+        values, _, is_done = reweighted(graph, values, converged)
         if is_done:
             return values
     parameters = gtsam.LevenbergMarquardtParams()
@@ -108,7 +108,7 @@ def optimise(
 
 def reweighted(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, converged: float
-) -> tuple[gtsam.Values, bool]:
+) -> tuple[gtsam.Values, float, bool]:
     """Gauss-Newton under kernels, until the relative decrease of the error is small.
 
     Weights of a kernel converge linearly: near the end each step is a constant part of the one
@@ -120,8 +120,8 @@ def reweighted(
     directions of a long path, which are those that Cholesky loses.
 
     Returns:
-        The best values, and whether they have converged: not where half a step raises the error,
-        or the graph is indeterminate. Damping is needed there.
+        The best values, the error there, and whether they have converged: not where half a step
+        raises the error, or the graph is indeterminate. Damping is needed there.
     """
     ordering: gtsam.Ordering | None = None
     error, before, share = graph.error(values), None, math.inf
@@ -132,7 +132,7 @@ def reweighted(
         try:
             step = _undamped(linear, ordering)
         except RuntimeError:
-            return values, False
+            return values, error, False
         factor = 1.0
         if before is not None and share < NEAR:
             factor = _extrapolation(before, step)
@@ -150,13 +150,13 @@ def reweighted(
             moved = values.retract(step.scale(0.5))
             now = graph.error(moved)
             if not now <= error:
-                return values, False
+                return values, error, False
         before = step if factor == 1.0 and is_straight else None
         decrease, error, values = error - now, now, moved
         share = decrease / error if error > 0.0 else 0.0
         if share < converged or decrease < CONVERGED_ABSOLUTE:
-            return values, True
-    return values, True
+            return values, error, True
+    return values, error, True
 
 
 def _undamped(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
@@ -222,14 +222,16 @@ def _can_fall(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, share: fl
 def marginals_of(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
-    pairs: Iterable[tuple[int, ...]] = (),
+    pairs: Collection[tuple[int, ...]] = (),
+    apart: Collection[tuple[int, ...]] = (),
     *,
     keep_rows: bool = False,
     use_qr: bool = False,
 ) -> CovarianceBlocks:
-    """Covariances of all variables and of pairs of poses: by Cholesky, or by QR where that fails.
+    """Covariances of all variables and of some together: by Cholesky, or by QR where that fails.
 
-    Errors are in body frames. ``keep_rows``: see `covariance_blocks`; ``use_qr``: by QR at once.
+    Errors are in body frames. ``pairs``, ``apart``, ``keep_rows``: see `covariance_blocks`;
+    ``use_qr``: by QR at once.
 
     Raises:
         RuntimeError: one is indeterminate.
@@ -237,11 +239,11 @@ def marginals_of(
     error = RuntimeError("")
     if not use_qr:
         try:
-            return covariance_blocks(graph.linearize(values), pairs, keep_rows=keep_rows)
+            return covariance_blocks(graph.linearize(values), pairs, apart, keep_rows=keep_rows)
         except RuntimeError as failed:
             error = failed
     linear = graph.linearize(values)
-    blocks = covariance_blocks(linear, pairs, use_qr=True, keep_rows=keep_rows)
+    blocks = covariance_blocks(linear, pairs, apart, use_qr=True, keep_rows=keep_rows)
     # QR does not fail on an indeterminate graph, its covariances are not finite
     if not all(np.isfinite(cov).all() for cov in blocks.marginals.values()):
         raise error

@@ -6,7 +6,7 @@ with both parts do residuals tell how large the noise is (C. R. Rao, Estimation 
 covariance components in linear models, JASA 67, 1972, DOI 10.1080/01621459.1972.10481212).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -79,7 +79,7 @@ class Posterior:
         Args:
             robot: its name.
             made: the n motions as they were solved, by the calibration that was found.
-            over_spans: the motions are those over `spans` of its states.
+            over_spans: the motions are those over `spans` of its states, which were asked for.
         """
         if over_spans:
             pairs = span_keys(self.builder, robot)
@@ -107,7 +107,7 @@ class Posterior:
             self._values([pair[end] for pair in pairs], dim)
             for end, dim in enumerate((3, model.dim))
         )
-        z, cov = (np.array([getattr(a, name) for *_, a in seen]) for name in ("z", "cov"))
+        z, cov = self.builder.polar[source]
         variance = np.diagonal(cov, axis1=1, axis2=2)
         if source in self.builder.noise:
             variance = variance * self.builder.noise[source].white
@@ -155,19 +155,25 @@ def span_keys(builder: RecordedGraph, robot: str) -> list[tuple[int, int]]:
 
 
 def posterior_pairs(
-    builder: RecordedGraph, calibrations: Mapping[str, tuple[int, IntArray]]
-) -> list[tuple[int, ...]]:
-    """Keys of the variables whose joint covariances `Posterior` needs.
+    builder: RecordedGraph,
+    calibrations: Mapping[str, tuple[int, IntArray]],
+    over_spans: Collection[str],
+) -> tuple[list[tuple[int, ...]], list[tuple[int, ...]]]:
+    """Keys of the variables whose joint covariances `Posterior` needs: in a factor, and over spans.
 
-    ``calibrations``: robot -> key of its calibration, and which of its parameters (p,) that has.
+    Args:
+        builder: of the graph.
+        calibrations: robot -> key of its calibration, and which of its parameters (p,) that has.
+        over_spans: robots whose motions over spans are wanted; these fill the information up.
     """
     own = {robot: (key,) for robot, (key, _) in calibrations.items()}
     over = [
         (*pair, *own.get(robot, ()))
         for robot in builder.robots
+        if robot in over_spans
         for pair in span_keys(builder, robot)
     ]
     moved = [(last, key, *own.get(robot, ())) for _, robot, last, key in builder.motions]
     seen = [(key, target) for own in builder.bearings_and_ranges.values() for key, target, _ in own]
     shared = [(a, b) for found in builder.shared_errors.values() for a, b in found.keys.tolist()]
-    return moved + over + seen + shared
+    return moved + seen + shared, over

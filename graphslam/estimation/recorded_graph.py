@@ -64,8 +64,9 @@ class RecordedGraph(BatchGraph):
 
     ``motions``: index in the graph, robot, and the keys of the states before and after.
     ``bearings_and_ranges``: by source, keys of the state and of the target of each, and its
-    association, and likewise ``segments``; ``shared_errors`` by source, where its ``noise`` has
-    such a part.
+    association, and likewise ``segments``; ``polar``: their bearings and ranges (n, 2) and the
+    covariances (n, 2, 2), as stated; ``shared_errors`` by source, where its ``noise`` has such a
+    part.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class RecordedGraph(BatchGraph):
         self.motions: list[tuple[int, str, int, int]] = []
         self.segments: list[tuple[int, int, Association]] = []
         self.bearings_and_ranges: dict[Source, list[tuple[int, int, Association]]] = {}
+        self.polar: dict[Source, tuple[Array, Array]] = {}
         self.shared_errors: dict[Source, SharedErrors] = {}
         self._stand_ins = 0
 
@@ -235,6 +237,7 @@ class RecordedGraph(BatchGraph):
             with covariance_of(describe(seen), seen.cov):
                 factors.gaussian(seen.cov)
         self.rows += z.size
+        self.polar[source] = z, cov
         kernel = self.kernel
         if source in self.noise:
             noise = self.noise[source]

@@ -8,6 +8,7 @@ of a Cauchy kernel whose squared scale is the number of degrees of freedom.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,9 +40,9 @@ class ResidualDistribution:
 
 def fit_distribution(normalised: Array) -> ResidualDistribution:
     """The distribution of residuals (n, k), each divided by the sigma that it should have."""
-    squared = np.ascontiguousarray(np.square(normalised).T)
-    fits = [_fit(squared, nu) for nu in DEGREES_OF_FREEDOM]
-    _, variance, nu = max(fits, key=lambda fit: fit[0])
+    fits = _fits(np.ascontiguousarray(np.square(normalised).T))
+    best = int(fits.likelihood.argmax())
+    variance, nu = fits.variance[best], DEGREES_OF_FREEDOM[best]
     k = normalised.shape[1]
     d2 = np.square(normalised / np.sqrt(variance)).sum(axis=1)
     w = 1.0 / (1.0 + d2 / nu)
@@ -50,19 +51,28 @@ def fit_distribution(normalised: Array) -> ResidualDistribution:
     return ResidualDistribution(variance * factor, math.sqrt(nu / factor))
 
 
-def _fit(squared: Array, nu: float) -> tuple[float, Array, float]:
-    """Log likelihood, variances (k,) of the scale, and ``nu`` degrees of freedom.
+class _Fits(NamedTuple):
+    """Log likelihoods (f,) and variances (f, k) of the scale, for each of `DEGREES_OF_FREEDOM`."""
 
-    ``squared`` (k, n): the residuals, each row contiguous.
-    """
+    likelihood: Array
+    variance: Array
+
+
+def _fits(squared: Array) -> _Fits:
+    """Distributions of residuals, ``squared`` (k, n), each row contiguous."""
     k, n = squared.shape
+    nu = np.array(DEGREES_OF_FREEDOM)[:, None]
     # a median of squares of normal variables is 0.455
-    variance = np.maximum(np.median(squared, axis=1) / 0.455, 1e-12)
+    begin = np.maximum(np.median(squared, axis=1) / 0.455, 1e-12)
+    variance = np.tile(begin, (len(nu), 1))
     for _ in range(ROUNDS):
-        variance = squared @ ((nu + k) / (nu + 1.0 / variance @ squared)) / n
-    each = math.lgamma((nu + k) / 2) - math.lgamma(nu / 2) - k / 2 * math.log(nu * math.pi)
-    tails = -(nu + k) / 2 * float(np.log1p(1.0 / variance @ squared / nu).sum())
-    return n * (each - 0.5 * float(np.log(variance).sum())) + tails, variance, nu
+        variance = ((nu + k) / (nu + 1.0 / variance @ squared)) @ squared.T / n
+    each = [
+        math.lgamma((v + k) / 2) - math.lgamma(v / 2) - k / 2 * math.log(v * math.pi)
+        for v in DEGREES_OF_FREEDOM
+    ]
+    tails = -(nu[:, 0] + k) / 2 * np.log1p(1.0 / variance @ squared / nu).sum(axis=1)
+    return _Fits(n * (each - 0.5 * np.log(variance).sum(axis=1)) + tails, variance)
 
 
 def shared_variance(found: Residuals) -> Array:

@@ -62,7 +62,11 @@ def robot_distances(
         for time_ns, a in offers
     ]
     try:
-        blocks = marginals_of(builder.graph, values, pairs, use_qr=builder.is_wide)
+        used, unused = (
+            [pair for pair, own in zip(pairs, is_used, strict=True) if bool(own) is of]
+            for of in (True, False)
+        )
+        blocks = marginals_of(builder.graph, values, used, unused, use_qr=builder.is_wide)
     except RuntimeError as error:
         raise builder.explain(error) from error
     d2 = np.zeros(len(offers))

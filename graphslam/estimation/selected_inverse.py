@@ -10,7 +10,7 @@ climbs its tree for each variable that it is asked for.
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -53,15 +53,18 @@ class CovarianceBlocks:
 def covariance_blocks(
     graph: gtsam.GaussianFactorGraph,
     pairs: Iterable[tuple[int, ...]] = (),
+    apart: Iterable[tuple[int, ...]] = (),
     *,
     use_qr: bool = False,
     keep_rows: bool = False,
 ) -> CovarianceBlocks:
-    """Covariances of all variables of a linear graph, and joint ones of ``pairs``.
+    """Covariances of all variables of a linear graph, joint ones of ``pairs`` and of ``apart``.
 
     Args:
-        graph: factors; it gains empty ones for those ``pairs`` that no factor connects.
-        pairs: keys of two different poses each, and of others to which factors connect both.
+        graph: factors; it gains empty ones for ``apart``.
+        pairs: keys of variables that are in one factor.
+        apart: keys of two different poses each, whether a factor connects them or not, and of
+            others to which factors connect both.
         use_qr: eliminate by QR, slower than Cholesky, but precise where information spans many
             orders of magnitude.
         keep_rows: whether to return the root too.
@@ -69,14 +72,10 @@ def covariance_blocks(
     Raises:
         RuntimeError: the graph is indeterminate (by QR: covariances are not finite instead).
     """
-    wanted = set(pairs)
-    if wanted:
-        linked = {tuple(graph.at(n).keys()) for n in range(graph.size())}
-        others = sorted(wanted - linked)  # most are in the order of a factor's keys
-        connected = set(map(frozenset, linked)) if others else set()
-        for pair in others:
-            if frozenset(pair) not in connected:
-                graph.add(_empty_factor(*pair[:2]))
+    wanted, others = set(pairs), sorted(set(apart))
+    for pair in others:
+        graph.add(_empty_factor(*pair[:2]))
+    wanted.update(others)
     cliques, clique_of = _eliminated(graph, use_qr)
     pairs_in: dict[int, list[tuple[int, ...]]] = defaultdict(list)
     for pair in wanted:
@@ -84,21 +83,18 @@ def covariance_blocks(
         pairs_in[max(map(clique_of.__getitem__, pair))].append(pair)
     marginals: dict[int, Array] = {}
     joint = _Blocks()
-    rows: list[CliqueRows] = []
     for number, clique in enumerate(cliques):
         above = None if clique.above is None else cliques[clique.above]
-        block = clique.square_root(above)
-        cov = clique.invert(above, block)
-        if keep_rows:
-            rows.append(clique.with_block(block))
+        cov = clique.invert(above)
         for key in clique.own:
-            rows_of = slice(clique.starts[key], clique.starts[key] + clique.sizes[key])
-            marginals[key] = cov[rows_of, rows_of]
+            rows = slice(clique.starts[key], clique.starts[key] + clique.sizes[key])
+            marginals[key] = cov[rows, rows]
         if number in pairs_in:
             joint.note(cov, clique, pairs_in[number])
         if above is not None:
             above.release()
-    return CovarianceBlocks(marginals, joint.read(), tuple(rows) if keep_rows else None)
+    rows_of = tuple(clique.rows() for clique in cliques) if keep_rows else None
+    return CovarianceBlocks(marginals, joint.read(), rows_of)
 
 
 def root_rows(graph: gtsam.GaussianFactorGraph, *, use_qr: bool = False) -> tuple[CliqueRows, ...]:
@@ -108,19 +104,7 @@ def root_rows(graph: gtsam.GaussianFactorGraph, *, use_qr: bool = False) -> tupl
         RuntimeError: the graph is indeterminate (by QR: the root is not finite instead).
     """
     cliques, _ = _eliminated(graph, use_qr)
-    rows = []
-    for clique in cliques:
-        block = clique.square_root(None if clique.above is None else cliques[clique.above])
-        rows.append(clique.with_block(block))
-    return tuple(rows)
-
-
-def _eliminated(
-    graph: gtsam.GaussianFactorGraph, use_qr: bool
-) -> tuple[list["_Clique"], dict[int, int]]:
-    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
-    by_qr = (gtsam.EliminateQR,) if use_qr else ()
-    return _cliques(graph.eliminateSequential(ordering, *by_qr))
+    return tuple(clique.rows() for clique in cliques)
 
 
 class _Blocks:
@@ -172,86 +156,53 @@ def _empty_factor(a: int, b: int) -> gtsam.JacobianFactor:
 class _Clique:
     """Variables whose rows of the square root end in the same later variables, the separator.
 
-    ``conditionals``: their rows, the last eliminated first. ``above``: the clique that has the
-    whole separator; None without separator. ``sizes``: key -> dimension, of all cliques.
-    ``starts``: key -> its first row in the covariance. ``joint_rows``: those of the separator in
-    the covariance above. ``below``: how many cliques still need the covariance.
+    ``conditional``: these rows. ``above``: number of the clique that has the whole separator; None
+    without separator. ``sizes``: key -> dimension, of all variables. ``starts``: key -> its first
+    row in the covariance. ``below``: how many cliques still need the covariance.
     """
 
-    conditionals: list[gtsam.GaussianConditional]
+    conditional: gtsam.GaussianConditional
     own: list[int]
-    separator: Sequence[int]
+    separator: list[int]
     above: int | None
-    sizes: dict[int, int]
-    starts: dict[int, int] = field(default_factory=dict)
-    joint_rows: list[int] = field(default_factory=list)
-    below: int = 0
+    below: int
+    sizes: Mapping[int, int]
+    starts: Mapping[int, int]
     _cov: Array | None = None
 
-    def square_root(self, above: "_Clique | None") -> Array:
-        """Rows (n, n + m) of the root of the own variables, and then of the separator."""
-        roots = [conditional.R() for conditional in self.conditionals]
-        starts, sizes, end = self.starts, self.sizes, 0
-        for key, root in zip(self.own, roots, strict=True):
-            starts[key], sizes[key] = end, len(root)
-            end += len(root)
-        own = end
-        if above is not None:
-            for key in self.separator:
-                starts[key], first, size = end, above.starts[key], sizes[key]
-                self.joint_rows += range(first, first + size)
-                end += size
-        return self._square_root(roots, own, end)
-
-    def with_block(self, block: Array) -> CliqueRows:
-        """What others see of it, with its rows of the root."""
+    def rows(self) -> CliqueRows:
+        """What others see of it."""
         own = {key: self.sizes[key] for key in self.own}
+        block = np.hstack((self.conditional.R(), self.conditional.S()))
         return CliqueRows(own, self.separator, self.above, block)
 
-    def invert(self, above: "_Clique | None", block: Array) -> Array:
-        """Covariance of the own variables and then the separator; kept while it is needed.
-
-        ``block``: its `square_root`.
-        """
-        own, end = block.shape
-        if above is None:
-            joint = np.zeros((0, 0))
-        else:
-            assert above._cov is not None
-            which = np.array(self.joint_rows)
-            joint = above._cov.take(which, axis=0).take(which, axis=1)
-        inverse, singular = dtrtri(block[:, :own])
+    def invert(self, above: "_Clique | None") -> Array:
+        """Covariance of the own variables and then the separator; kept while it is needed."""
+        inverse, singular = dtrtri(self.conditional.R())
+        inverse, own = np.asarray(inverse), len(inverse)
         if singular:
             inverse = np.full((own, own), np.nan)
-        gain = inverse @ block[:, own:]
-        cov = np.empty((end, end))
-        cross = gain @ joint
-        cov[:own, :own] = inverse @ inverse.T + cross @ gain.T
-        np.negative(cross, out=cov[:own, own:])
-        np.negative(cross.T, out=cov[own:, :own])
-        cov[own:, own:] = joint
+        if above is None:
+            cov = np.asarray(inverse @ inverse.T)
+        else:
+            assert above._cov is not None
+            starts, sizes = above.starts, self.sizes
+            held: list[int] = []
+            for key in self.separator:
+                held += range(starts[key], starts[key] + sizes[key])
+            which = np.array(held)
+            joint = above._cov.take(which, axis=0).take(which, axis=1)
+            gain = inverse @ self.conditional.S()
+            cross = gain @ joint
+            end = own + len(joint)
+            cov = np.empty((end, end))
+            cov[:own, :own] = inverse @ inverse.T + cross @ gain.T
+            np.negative(cross, out=cov[:own, own:])
+            np.negative(cross.T, out=cov[own:, :own])
+            cov[own:, own:] = joint
         if self.below:
             self._cov = cov
         return cov
-
-    def _square_root(self, roots: Sequence[Array], own: int, end: int) -> Array:
-        """Rows of the own variables: upper triangular (n, n), and (n, m) of the separator.
-
-        ``roots``: of each own variable the triangle of its own.
-        """
-        R = np.zeros((own, end))
-        if len(self.own) == 1:
-            R[:, :own] = roots[0]
-            R[:, own:] = self.conditionals[0].S()
-            return R
-        starts, sizes = self.starts, self.sizes
-        for key, root, conditional in zip(self.own, roots, self.conditionals, strict=True):
-            rows, (_, *others) = slice(starts[key], starts[key] + sizes[key]), conditional.keys()
-            R[rows, rows] = root
-            R[rows, [row for k in others for row in range(starts[k], starts[k] + sizes[k])]] = (
-                conditional.S()
-            )
-        return R
 
     def release(self) -> None:
         """One clique less needs the covariance."""
@@ -260,33 +211,30 @@ class _Clique:
             self._cov = None
 
 
-def _cliques(net: gtsam.GaussianBayesNet) -> tuple[list[_Clique], dict[int, int]]:
-    """Cliques of a net, each after the one above it, and the clique of each variable."""
-    conditionals = [net.at(n) for n in range(net.size())]
-    keys = [conditional.keys() for conditional in conditionals]
-    number = {own[0]: n for n, own in enumerate(keys)}
+def _eliminated(
+    graph: gtsam.GaussianFactorGraph, use_qr: bool
+) -> tuple[list[_Clique], dict[int, int]]:
+    """Cliques of a graph, each after the one above it, and the clique of each variable."""
+    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
+    by_qr = (gtsam.EliminateQR,) if use_qr else ()
+    tree = graph.eliminateMultifrontal(ordering, *by_qr)
+    gradient = graph.gradientAtZero()
+    sizes = {key: len(gradient.at(key)) for key in map(ordering.at, range(ordering.size()))}
     cliques: list[_Clique] = []
     clique_of: dict[int, int] = {}
-    sizes: dict[int, int] = {}
-    for n in reversed(range(len(keys))):
-        key, *others = keys[n]
-        following = min(map(number.__getitem__, others), default=None)
-        if following is None:
-            above = None
-        else:
-            above = clique_of[keys[following][0]]
-            one = cliques[above]
-            if one.own[-1] == keys[following][0] and len(others) == len(one.own) + len(
-                one.separator
-            ):
-                one.own.append(key)
-                one.conditionals.append(conditionals[n])
-                clique_of[key] = above
-                continue
-            one.below += 1
-        clique_of[key] = len(cliques)
-        cliques.append(_Clique([conditionals[n]], [key], others, above, sizes))
-    for one in cliques:  # in the order of elimination the square root is upper triangular
-        one.own.reverse()
-        one.conditionals.reverse()
+    waiting: list[tuple[gtsam.GaussianBayesTreeClique, int | None]] = []
+    waiting += [(root, None) for root in tree.roots()]
+    while waiting:
+        node, above = waiting.pop()
+        number, below, conditional = len(cliques), node.nrChildren(), node.conditional()
+        keys, dim = conditional.keys(), len(conditional.R())
+        starts, count, end = {}, 0, 0
+        for key in keys:
+            count += end < dim
+            starts[key] = end
+            end += sizes[key]
+        own = keys[:count]
+        clique_of.update(dict.fromkeys(own, number))
+        cliques.append(_Clique(conditional, own, keys[count:], above, below, sizes, starts))
+        waiting += [(node[k], number) for k in range(below)]
     return cliques, clique_of

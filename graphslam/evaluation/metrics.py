@@ -35,6 +35,8 @@ from graphslam.evaluation.trajectory_metrics import PosePairs, pair_poses, traje
 from graphslam.results.folder import SavedResult
 from graphslam.results.joint_file import joint_scans
 
+#: ms that a pose takes in the numbers of its trajectory
+POSE_MS = 0.0025
 #: numbers that are undefined where estimate and truth have no frame in common
 _WORLD_METRICS = dict.fromkeys(("ate_rmse_m", "max_m", "heading_rmse_rad", *NEES_NUMBERS))
 
@@ -177,7 +179,9 @@ def _compare_trajectories(
             if all(kind in both for both in in_world)
         }
     efforts = [sum(len(one) for one in group) for group in groups.values()]
-    values = parallel_map(trajectory_metrics, list(groups.values()), efforts=efforts)
+    values = parallel_map(
+        trajectory_metrics, list(groups.values()), efforts=efforts, unit_ms=POSE_MS
+    )
     metrics = dict(zip(groups, values, strict=True))
     found: dict[str, Any] = {
         "robots": {

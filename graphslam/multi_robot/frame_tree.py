@@ -26,6 +26,9 @@ from graphslam.multi_robot.relative_frames import (
     estimate_relative_frame,
 )
 
+#: ms that a sighting of one robot by another takes for the relation of the two
+SIGHTING_MS = 0.15
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameAssignment:
@@ -121,7 +124,8 @@ def build_frame_tree(
         return estimate_relative_frame(a, b, known, by_pair[pair], config)
 
     efforts = [1.0 + len(by_pair[pair]) for pair in pairs]
-    for pair, relation in zip(pairs, parallel_map(relate, pairs, efforts=efforts), strict=True):
+    related = parallel_map(relate, pairs, efforts=efforts, unit_ms=SIGHTING_MS)
+    for pair, relation in zip(pairs, related, strict=True):
         if isinstance(relation, RelativeFrame):
             relations.append(relation)
             if not _is_turned_anyhow(relation, known):

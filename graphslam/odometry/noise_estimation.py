@@ -17,6 +17,7 @@ from graphslam.core.arrays import IntArray
 from graphslam.core.config import OdometryConfig
 from graphslam.core.geometry import Array
 from graphslam.core.motion_models import RATES
+from graphslam.core.non_negative import non_negative_least_squares
 from graphslam.odometry.increment_sums import transformed
 from graphslam.odometry.mounted_motions import lever_to
 from graphslam.odometry.preintegration import Track, path_sums
@@ -194,18 +195,17 @@ def variances_by_rate(track: Track, start_ns: IntArray, end_ns: IntArray) -> Arr
         times, at = np.unique(np.concatenate([start, end]), return_inverse=True)
         sums, _ = path_sums([track], [times], by_rate=True)
         motions = sums.motions_between(*np.split(at, 2))
-        covs = transformed(motions.cov, lever_to(motions.delta, mount))
+        covs = motions.cov
+        if mount.any():
+            covs = transformed(covs, lever_to(motions.delta, mount))
         found.append(np.diagonal(covs, axis1=2, axis2=3).mT)
     return np.concatenate(found)
 
 
 def _non_negative(A: Array, b: Array) -> Array:
     """Least squares A x = b with x ≥ 0."""
-    from scipy.optimize import nnls  # noqa: PLC0415  (imports for long)
-
     scale = np.linalg.norm(A, axis=0)
     scale[scale == 0] = 1.0
     # nine unknowns, tens of thousands of rows
     q, root = np.linalg.qr(A / scale)
-    x, _ = nnls(root, q.T @ b)
-    return np.asarray(x / scale)
+    return np.asarray(non_negative_least_squares(root, q.T @ b) / scale)

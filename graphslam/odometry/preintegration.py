@@ -37,7 +37,7 @@ from graphslam.core.records import Motion, Trajectory
 from graphslam.odometry.coarse_motions import coarse_motions
 from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
 from graphslam.odometry.integration_windows import in_windows
-from graphslam.odometry.mounted_motions import of_mount
+from graphslam.odometry.mounted_motions import calibration_covs, of_mount
 from graphslam.odometry.readings import Readings
 
 #: m and rad: sigma of the motion of a robot that reports none
@@ -397,8 +397,8 @@ class _SumsAtStates:
             observable = np.array([not track.has_burst_stamps for track in tracks])
             by_latency = change * np.where(observable, 1e9 / LATENCY_STEP_NS, 0.0)[which, None]
             delta, cov, d_cal = of_mount(delta, cov, d_cal, mount, by_latency)
-        known = np.array([track.calibration.cov for track in tracks])[which]
-        cov = (cov + cov.mT) / 2 + d_cal @ known @ d_cal.mT
+        known = np.array([track.calibration.cov for track in tracks])
+        cov = (cov + cov.mT) / 2 + calibration_covs(d_cal, known, which)
         moved, floor = (length > 0) | (delta[:, 2] != 0), tracks[0].floor_cov
         cov = cov + np.where(moved[:, None, None], floor, tracks[0].floor_cov_of(False))
         back = end < start

@@ -8,7 +8,6 @@ accumulator (eq. 4.29-4.31) sums the weights in a table.
 from functools import lru_cache
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from graphslam.core.config import FrontEndConfig
@@ -141,6 +140,8 @@ class OpenCvVotes:
 
     def _proposals(self) -> tuple[Array, Array]:
         """Distances d (p,) m and angles γ (p,) rad of the lines with most returns, unweighted."""
+        import cv2  # noqa: PLC0415  (16 MB, which only scans need)
+
         config, points = self._config, self._points[self._voting]
         steps = (config.hough_gamma_steps + 1) // 2
         step = np.pi / steps

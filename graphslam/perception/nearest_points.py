@@ -9,7 +9,6 @@ cell's diagonal.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +30,8 @@ class NearestPoints:
     @classmethod
     def of(cls, points: Array, cell_m: float, reach_m: float) -> "NearestPoints":
         """The grid of points (n, 2) m, with a margin of ``reach_m`` around them."""
+        import cv2  # noqa: PLC0415  (16 MB, which only scans need)
+
         margin = int(np.ceil(reach_m / cell_m)) + 1
         low = points.min(axis=0) - margin * cell_m
         cells = np.floor((points - low) / cell_m).astype(np.intp)

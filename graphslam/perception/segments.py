@@ -9,7 +9,6 @@ squares and checked for validity.
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from graphslam.core.config import FrontEndConfig
@@ -168,6 +167,8 @@ def _split(sweep: Sweep, returns: Returns, config: FrontEndConfig) -> Pieces:
     The thesis splits by the recursion of Douglas and Peucker. So does OpenCV, which then drops
     vertices that their neighbours make redundant; the merge step would join those pieces anyway.
     """
+    import cv2  # noqa: PLC0415  (16 MB, which only scans need)
+
     starts = _chain_starts(sweep, config)
     stops = np.append(starts[1:], len(sweep.beam))
     points = sweep.points.astype(np.float32)

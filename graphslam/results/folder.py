@@ -62,6 +62,8 @@ class SavedResult(ResultViews):
 
 
 JOINT_FILE = "joint.npz"
+#: ms that a pose takes in all files of its robot
+POSE_MS = 0.005
 
 # ---------------------------------------------------------------- writing
 
@@ -99,7 +101,9 @@ def _files(
     yield "landmarks.json", to_json(landmarks, "landmarks.json")
     yield "graph.g2o", graph_g2o(result.steps, result.estimate, kernel_of(result))
     yield "graph_ids.csv", graph_ids(result.estimate)
-    for own in parallel_map(trajectory_files, list(result.robots.items())):
+    poses = [float(len(robot.final)) for robot in result.robots.values()]
+    robots = list(result.robots.items())
+    for own in parallel_map(trajectory_files, robots, efforts=poses, unit_ms=POSE_MS):
         yield from own
     joint = joint_scans(result.estimate, result.robots)
     if joint is not None:

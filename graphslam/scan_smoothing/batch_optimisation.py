@@ -30,6 +30,7 @@ from graphslam.estimation.motion_noise import (
     middle_of_paths,
     noise_scales,
     scale_motion_noise,
+    stated_robots,
 )
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.posterior_residuals import Posterior
@@ -145,7 +146,7 @@ class _Problem:
                 steps = self._with_motions(self._steps, graph.solution()[0])
                 graph.calibrate_motions(steps, self._initial)
             graph.optimise(CONVERGED_ERROR_ROUGH)
-            yield graph.posterior()
+            yield graph.posterior(stated_robots(self._tracks))
 
     def solve_roughly(self) -> CalibratedSolution:
         """Without covariances, and ended early."""

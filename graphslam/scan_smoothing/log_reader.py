@@ -60,11 +60,12 @@ def receive_log(reading: Reading, config: Config) -> LogSet:
 
     They are what `LogSet.messages` gives without `TRUE_RECORDS`.
     """
-    # association needs it, and it is slow to import: the log is still being opened
-    import scipy.optimize  # noqa: F401, PLC0415
-
     log = reading.receive()
     assert isinstance(log, LogSet)
+    if any(map(log.has_scans, log.robots)):
+        # association needs it, and it is slow to import: the first scans are still being read
+        import scipy.optimize  # noqa: F401, PLC0415
+
     if not is_scan_log(log, config):
         log.expect(_received(reading, log.count(TRUE_RECORDS) // BATCH), TRUE_RECORDS)
     return log

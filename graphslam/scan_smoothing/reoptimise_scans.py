@@ -20,7 +20,12 @@ from graphslam.estimation.batch_calibration import ROUNDS, calibrate, recompute_
 from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.estimation.joint_covariances import mount_errors
 from graphslam.estimation.log_noise import LogNoise
-from graphslam.estimation.motion_noise import fit_motion_noise, noise_scales, scale_motion_noise
+from graphslam.estimation.motion_noise import (
+    fit_motion_noise,
+    noise_scales,
+    scale_motion_noise,
+    stated_robots,
+)
 from graphslam.mapping.composite_walls import split_composites
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
@@ -173,7 +178,7 @@ def _calibrated(
     estimate, _ = calibrate(
         rebuild, estimate, tracks, config.robust, 1, rough=alone, solved_once=keep
     )
-    noise = fit_motion_noise(tracks, [solved[0].graph.posterior()])
+    noise = fit_motion_noise(tracks, [solved[0].graph.posterior(stated_robots(tracks))])
     if not alone:
         # the world lies where the mount of the first robot puts it: a mount that this drive
         # does not tell would move the others away from where they started

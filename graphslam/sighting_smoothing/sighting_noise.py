@@ -7,12 +7,12 @@ noise that is new in every sighting, and errors that sightings of one target sha
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
+from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Sighting, Start, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph
 from graphslam.estimation.log_noise import MOTION, LogNoise, has_state_at_every_sighting, is_white
@@ -21,11 +21,12 @@ from graphslam.estimation.motion_noise import (
     NoiseFit,
     fit_track_noise,
     measured_motion_noise,
+    stated_robots,
 )
 from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
-from graphslam.odometry.noise_estimation import is_stated, with_fit_uncertainty, without_floors
+from graphslam.odometry.noise_estimation import with_fit_uncertainty, without_floors
 from graphslam.odometry.preintegration import Track
 from graphslam.sighting_smoothing.sensor_latency import hold_insignificant_latency
 from graphslam.sighting_smoothing.sighting_states import (
@@ -129,7 +130,7 @@ def _estimated(
     one = np.ones(2)
     sources = {(a.robot, a.model) for s in steps for a in s.associations if len(a.z) == 2}
     noise = {source: ObservationNoise(one, one, config.robust.scale) for source in sources}
-    stated = {name for name, track in tracks.items() if is_stated(track)}
+    stated = stated_robots(tracks)
     for name in stated:
         tracks[name].config = without_floors(tracks[name].config)
     measured: dict[Source, Array] = {}
@@ -143,7 +144,7 @@ def _estimated(
             made, estimate, priors, initial, config.robust, noise, calibrated=True
         )
         estimate, calibrations = graph.solve(CONVERGED_ERROR)
-        posterior = graph.posterior()
+        posterior = graph.posterior(stated)
         new = _sighting_noise(posterior, noise)
         change = _largest_change(noise, new)
         noise = new
@@ -205,10 +206,9 @@ def _is_measured(posterior: Posterior, source: Source) -> Array:
     sees bearings alone writes some constant as range. Its residuals are far below such a sigma, as
     the constant has about the right size, and tell nothing of a measurement.
     """
-    seen = [a for *_, a in posterior.builder.bearings_and_ranges[source]]
-    sigmas = np.sqrt(np.diagonal([a.cov for a in seen], axis1=1, axis2=2))
-    ranges = np.array([a.z[1] for a in seen])
-    return np.asarray(np.median(sigmas, axis=0) < [UNKNOWN_BEARING_RAD, np.median(ranges)])
+    z, cov = posterior.builder.polar[source]
+    sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    return np.asarray(np.median(sigmas, axis=0) < [UNKNOWN_BEARING_RAD, np.median(z[:, 1])])
 
 
 def _cautious(found: ObservationNoise, config: Config) -> ObservationNoise:

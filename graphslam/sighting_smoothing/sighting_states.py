@@ -7,7 +7,6 @@ time, and what it shares with others by odometry is in the motions between the s
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, exp, inverse, log, wrap
 from graphslam.core.motion_models import HELD_SIGMA
 from graphslam.core.observation_models import transport
+from graphslam.core.record import replace
 from graphslam.core.records import (
     Association,
     Closure,
@@ -111,6 +111,8 @@ def _robots(a: Association) -> set[str]:
 
 def measured_from_base(sighting: Sighting) -> tuple[Array, Array]:
     """A sighting as measured from its robot's base: z (k,) and its covariance (k, k)."""
+    if len(sighting.z) == 2 and not sighting.mount.any():
+        return sighting.z, sighting.cov
     o = sighting_observation(sighting)
     if not sighting.mount.any():
         return o.z, o.cov

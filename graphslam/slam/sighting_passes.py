@@ -24,6 +24,9 @@ from graphslam.sighting_smoothing.sighting_solution import (
 from graphslam.slam.initialisation import with_identities
 from graphslam.slam.passes import decide_next_pass, find_clocks, find_swapped_names
 
+#: ms that a sighting of a robot takes for the clocks: by the paths, and in the whole graph
+PATH_CLOCK_MS, CLOCK_MS = 0.05, 0.09
+
 
 def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass | None:
     """`run_passes` without an incremental estimate; None for logs that need one.
@@ -65,7 +68,11 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
                 replayed.cancel()
                 return None
             # all that is finer depends on the clocks; paths need the calibration
-            asked = Future(partial(clocks_from_paths, one.seen_robots, one.tracks, config))
+            seen = one.seen_robots
+            asked = Future(
+                partial(clocks_from_paths, seen, one.tracks, config),
+                about_ms=PATH_CLOCK_MS * len(seen),
+            )
             rough = with_gated_robots(one, rough, made)
             clocks = asked.result()
             if clocks and not known.clocks:
@@ -77,7 +84,9 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
             for run in one.started.values():
                 run.is_calibrated = True
             # a log is seldom read again, so the result does not wait to know
-            clocks_asked = Future(partial(find_clocks, one, estimate, coarsely=False))
+            clocks_asked = Future(
+                partial(find_clocks, one, estimate, coarsely=False), about_ms=CLOCK_MS * len(seen)
+            )
             swapped = find_swapped_names(one, estimate)
             estimate = settled(one.steps, estimate, one.kernel)
             found = clocks_asked.result()

@@ -17,8 +17,6 @@ from graphslam.pipeline.log_pass import Progress
 from graphslam.pipeline.robot_settings import check_robots
 from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.scan_smoothing.log_reader import Reading
-from graphslam.scan_smoothing.scan_log import solve_scan_log
-from graphslam.scan_smoothing.session_log import solve_session_log
 from graphslam.slam.failures import explained
 from graphslam.slam.final_result import make_result
 from graphslam.slam.initialisation import initialise
@@ -76,12 +74,17 @@ def _solved(
     log, config = job.log, job.config
     if is_pose_graph(log, config):
         return make_result(solve_pose_graph(job), began)
+    # what only logs of scans need is imported for these
     if is_session_log(log, config):
+        from graphslam.scan_smoothing.session_log import solve_session_log  # noqa: PLC0415
+
         return make_result(solve_session_log(job), began)
     known = job.kept.stage("starts", lambda: initialise(log, config))
     known = replace(known, known_map=known_map)
     initialised = time.perf_counter()
     if is_scan_log(log, config):
+        from graphslam.scan_smoothing.scan_log import solve_scan_log  # noqa: PLC0415
+
         finished: FinishedPass | None = solve_scan_log(job, known, ahead)
     else:
         finished = run_sighting_passes(job, known)

@@ -556,6 +556,19 @@ def test_a_log_is_being_read_before_what_only_the_estimate_needs_is_imported(tmp
     assert not loaded & {"gtsam", "cv2", "scipy.linalg", "rich", "graphslam.results.folder"}
 
 
+def test_sightings_are_solved_without_what_only_scans_need():
+    """OpenCV and what matches scans take 30 MB and a twentieth of a small log of sightings."""
+    code = (
+        "import sys, graphslam.slam.smooth, graphslam.results.report\n"
+        "from graphslam.odometry import noise_estimation\n"
+        "print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "graphslam.slam.sighting_passes" in loaded
+    assert not loaded & {"cv2", "scipy.optimize", "graphslam.scan_smoothing.scan_log"}
+
+
 def test_a_process_of_its_own_ends_with_its_exit_code_and_all_of_its_output(tmp_path):
     """It ends without the usual steps of Python: an output that is not flushed first is lost."""
     missing = [sys.executable, "-m", "graphslam", "info", str(tmp_path / "none.mcap")]

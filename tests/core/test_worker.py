@@ -246,3 +246,16 @@ def test_smooth_writes_the_same_with_and_without(tmp_path):
     one, two = (json.loads((tmp_path / n / "summary.json").read_text()) for n in ("one", "two"))
     for key in ("counts", "clocks", "calibration", "warnings", "graph"):
         assert one[key] == two[key], key
+
+
+def test_small_work_does_not_fork():
+    """A second process takes 40 ms of CPU time beside its work: what is known to take less than
+    twice that runs here, what takes more or is not known does not."""
+    lines = printed("""
+        def own(_=None):
+            return os.getpid() == here
+        print(*(Future(own, about_ms=ms).result() for ms in (10.0, 100.0)))
+        efforts = [5.0, 10.0, 6.0]
+        print(*(parallel_map(own, efforts, efforts=efforts, unit_ms=ms) for ms in (1.0, 10.0)))
+    """)
+    assert lines == ["True False", "[True, True, True] [False, True, False]"]

@@ -62,7 +62,7 @@ def test_extrapolated_steps_end_nearer_to_the_minimum_after_fewer_of_them():
         parameters.setAbsoluteErrorTol(1e-9)
         plain = gtsam.GaussNewtonOptimizer(graph, start, parameters)
         walked, one = plain.optimize(), counted(graph)
-        found, is_done = reweighted(one, start, 1e-6)
+        found, _, is_done = reweighted(one, start, 1e-6)
         parameters.setRelativeErrorTol(1e-14)
         least = gtsam.GaussNewtonOptimizer(graph, found, parameters).optimize()
         assert is_done
@@ -82,7 +82,7 @@ def test_a_step_that_cholesky_loses_is_found_by_qr():
             graph.add(gtsam.BetweenFactorPose2(k - 1, k, gtsam.Pose2(1.0, 0.0, 0.0), stiff))
     with pytest.raises(RuntimeError):
         graph.linearize(start).optimize()
-    found, is_done = reweighted(graph, start, 1e-6)
+    found, _, is_done = reweighted(graph, start, 1e-6)
     assert is_done
     assert graph.error(found) < 1e-6  # of 1e12 at first
 
@@ -94,7 +94,7 @@ def test_a_step_that_raises_the_error_is_not_taken():
     rng, far = np.random.default_rng(1), gtsam.Values()
     for k in range(240):
         far.insert(k, gtsam.Pose2(*(np.array([30.0, 30.0, 3.0]) * rng.normal(size=3))))
-    found, is_done = reweighted(graph, far, 1e-6)
+    found, _, is_done = reweighted(graph, far, 1e-6)
     assert not is_done
     assert graph.error(found) <= graph.error(far)
     assert graph.error(optimise(graph, far, CAUCHY)) < graph.error(found)

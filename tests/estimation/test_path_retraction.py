@@ -82,5 +82,5 @@ def test_a_path_that_turns_as_a_whole_is_there_in_one_step(robots):
     before = graph.error(values)
     assert graph.error(values.retract(step)) > 10 * before
     assert graph.error(PathRetraction(graph)(values, step)) < 1e-6 * before
-    solved, is_done = reweighted(graph, values, CONVERGED_ERROR_ROBUST)
+    solved, _, is_done = reweighted(graph, values, CONVERGED_ERROR_ROBUST)
     assert is_done and graph.error(solved) < 1e-6 * before

@@ -47,8 +47,8 @@ def mixed_graph(seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_blocks_are_those_of_the_inverse(seed, use_qr):
     """Of the dense inverse, for every variable, for pairs with a factor in either order, and for
-    pairs without: one of these is in two components, whose cross covariance is zero. Also for pairs
-    together with what all motions share."""
+    pairs that need none: one of these is in two components, whose cross covariance is zero. Also
+    for pairs together with what all motions share."""
     graph, linked = mixed_graph(seed)
     pairs = [*linked, (3, 17), (POSES - 1, POSES // 2), (59, 0), (4, 5, 5000), (20, 6, 5000)]
     keys = sorted(graph.keyVector())
@@ -59,7 +59,7 @@ def test_blocks_are_those_of_the_inverse(seed, use_qr):
     P = np.linalg.inv(graph.hessian(ordering)[0])
     starts = dict(zip(keys, np.cumsum([0, *(size[key] for key in keys)]).tolist(), strict=False))
     rows = {key: list(range(starts[key], starts[key] + size[key])) for key in keys}
-    found = covariance_blocks(graph, pairs, use_qr=use_qr)
+    found = covariance_blocks(graph, linked, pairs, use_qr=use_qr)
     assert set(found.marginals) == set(keys) and set(found.joint) == set(pairs)
     for key, cov in found.marginals.items():
         np.testing.assert_allclose(cov, P[np.ix_(rows[key], rows[key])], rtol=1e-7, atol=1e-9)

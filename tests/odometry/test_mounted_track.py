@@ -11,6 +11,7 @@ from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import between, compose, exp, inverse, inverse_cov, rotation3
 from graphslam.core.motion_models import nominal_calibration
 from graphslam.core.records import OdometryIncrement, OdometryPose, WheelAngles
+from graphslam.odometry.mounted_motions import calibration_covs
 from graphslam.odometry.noise_estimation import without_floors
 from graphslam.odometry.preintegration import LATENCY_STEP_NS, STANDING_SIGMA, Track
 
@@ -378,3 +379,31 @@ def test_an_error_of_the_base_moves_the_sensor_with_its_lever_arm():
     cov = track.motion(0, S).cov
     lever = rotation3(0.5) @ np.array([0.0, 2.0, 1.0])
     np.testing.assert_allclose(cov, 1e-4 * 0.5 * np.outer(lever, lever), atol=1e-15)
+
+
+# ------------------------------------------------------------ a sensor without a lever arm
+
+
+def test_motions_without_a_mount_are_those_with_a_tiny_one():
+    """Without a mount the lever arm is left out of the calculation. Breaks if a column of the
+    derivative, the wrapping of the heading or the covariance of the calibration is left out too;
+    2e-12 m moves the path of a few metres by about as much."""
+    times = np.arange(0, 40.01, 0.1)  # turns by 6 rad
+    found = []
+    for mount in (np.zeros(3), np.full(3, 2e-12)):
+        mean = np.array([0.01, 0.02, 0.0, *mount, LATE_S])
+        track = track_of(times, curve(times), mean=mean, mounted=True)
+        begin = np.arange(1, 30) * S
+        found.append(track.motions(begin, np.append(begin[1:], 38 * S)))
+    for name in ("delta", "cov", "d_cal"):
+        np.testing.assert_allclose(*(getattr(one, name) for one in found), atol=1e-9, err_msg=name)
+
+
+def test_motions_of_one_track_and_of_several_have_the_same_covariance():
+    """By the calibration of each: of one track that is a single product of matrices."""
+    rng = np.random.default_rng(0)
+    d_cal, A = rng.normal(size=(20, 3, 7)), rng.normal(size=(2, 7, 7))
+    known, which = A @ A.mT, np.repeat([0, 1], 10)
+    both = calibration_covs(d_cal, known, which)
+    each = [calibration_covs(d_cal[which == k], known[k : k + 1], which[:10] * 0) for k in (0, 1)]
+    np.testing.assert_allclose(both, np.concatenate(each), rtol=1e-12)
