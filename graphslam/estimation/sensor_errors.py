@@ -146,7 +146,7 @@ def shown_errors(
 
 def _taken(solved: SolvedGraph, moved: Array) -> tuple[Array, Array]:
     """`ShownErrors.taken` (k,), and its derivative (k, p) by all calibrations, sign apart."""
-    taken, by = np.zeros(moved.shape[1]), [np.zeros((moved.shape[1], 0))]
+    taken, by = np.zeros(moved.shape[1]), list[Array]([np.zeros((moved.shape[1], 0))])
     for robot, (key, prior) in solved.calibrations.items():
         by.append(np.linalg.solve(prior.cov, moved[solved.root.mounts[robot]]).T)
         taken -= by[-1] @ (solved.values.atVector(key) - prior.mean)
@@ -248,11 +248,11 @@ def _targets(
         ]
         t, rows = zip(*found, strict=True)
         return np.array(t)[of], np.array(rows, dtype=np.int64)[of]
-    t, rows = np.zeros((len(observed), 3)), np.zeros(len(observed), dtype=np.int64)
+    poses, first = np.zeros((len(observed), 3)), np.zeros(len(observed), dtype=np.int64)
     seen_ns = np.array([time_ns for time_ns, _ in observed], dtype=np.int64)
     for robot in set(names):
         own = np.array([name == robot for name in names])
         number = builder.states.numbers(str(robot), seen_ns[own])
-        t[own] = builder.poses_at(solved.values, builder.state_key(str(robot), 0) + number)
-        rows[own] = root.states[str(robot)][number]
-    return t, rows
+        poses[own] = builder.poses_at(solved.values, builder.state_key(str(robot), 0) + number)
+        first[own] = root.states[str(robot)][number]
+    return poses, first

@@ -237,6 +237,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "scans": scan_doubts,
     "sightings": sighting_doubts,
     "turned sensors": turned_sensor_doubts,
+    "sensor errors": large_error_doubts,
     "regular landmarks": regular_landmark_doubts,
     "points": vanished_doubts,
     "moved": moved_doubts,
