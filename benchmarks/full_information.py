@@ -302,7 +302,8 @@ def main() -> int:
     given = arguments.parse_args()
     missed = 0
     print(
-        "kind         error, m (batch)    ratio  of each        NEES/dof (batch)  ratio  points  CPU s"
+        "kind         error, m (batch)    ratio  of each        NEES/dof (batch)  ratio  points"
+        "  CPU s"
     )
     for name in given.kinds:
         kind, _, fault = name.partition("-")

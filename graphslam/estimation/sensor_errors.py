@@ -146,11 +146,13 @@ def shown_errors(
 
 def _taken(solved: SolvedGraph, moved: Array) -> tuple[Array, Array]:
     """`ShownErrors.taken` (k,), and its derivative (k, p) by all calibrations, sign apart."""
-    taken, by = np.zeros(moved.shape[1]), list[Array]([np.zeros((moved.shape[1], 0))])
+    k = moved.shape[1]
+    taken, parts = np.zeros(k), []
     for robot, (key, prior) in solved.calibrations.items():
-        by.append(np.linalg.solve(prior.cov, moved[solved.root.mounts[robot]]).T)
-        taken -= by[-1] @ (solved.values.atVector(key) - prior.mean)
-    return taken, np.concatenate(by, axis=1)
+        by = np.linalg.solve(prior.cov, moved[solved.root.mounts[robot]]).T
+        parts.append(by)
+        taken -= by @ (solved.values.atVector(key) - prior.mean)
+    return taken, np.hstack([np.zeros((k, 0)), *parts])
 
 
 def _sum_of_squares(rows: Array) -> Array:
