@@ -63,7 +63,7 @@ class Sensors:
         return cls(tuple(names), tuple(chosen), of)
 
     def corrected(self, sources: Sequence[Sighting], errors: Array) -> list[Sighting]:
-        """Sightings as sensors without ``errors`` (2 n,) would have made them."""
+        """Sightings as sensors without ``errors`` (k,), rad and relative, would have made them."""
         return [
             _corrected(s, *errors[2 * self.of[k] : 2 * self.of[k] + 2].tolist())
             for k, s in enumerate(sources)
