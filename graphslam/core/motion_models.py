@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3, wrap
 
@@ -121,6 +122,11 @@ class Calibration:
         The variance is 1e-18, not 0, so that covariances stay invertible.
         """
         return Calibration(self.names, self.mean, 1e-18 * np.eye(len(self.mean)))
+
+    def part(self, parameters: IntArray) -> "Calibration":
+        """That of some parameters alone."""
+        names = tuple(self.names[k] for k in parameters.tolist())
+        return Calibration(names, self.mean[parameters], self.cov[np.ix_(parameters, parameters)])
 
     def at_zero(self, parameters: Sequence[int]) -> "Calibration":
         """The same with some parameters zero and held."""

@@ -20,6 +20,8 @@ CalibrationParameter = Literal[
     "laser_y_m",
     "laser_yaw_rad",
     "laser_latency_s",
+    "sighting_yaw_rad",
+    "sighting_range_scale",
 ]
 
 
@@ -112,7 +114,9 @@ class OdometryConfig:
     laser_sigma_m, laser_sigma_rad: error of the laser's mounting pose given by the log;
     laser_latency_sigma_s: offset of its clock from the odometry's;
     sighting_latency_sigma_s: the same for a robot without a laser, whose odometry may be commands
-    that the motion follows later.
+    that the motion follows later;
+    sighting_sigma_rad, sighting_scale_sigma: by how much a sensor of sightings is mounted turned,
+    and its ranges are too long, relative; applied if the log clearly shows it (back end batch).
     commanded_velocities: the odometry poses integrate commanded, not measured, velocities;
     turning_lever_sigma_m: distance between the middle of the axle and the point whose speed was
     commanded.
@@ -154,6 +158,8 @@ class OdometryConfig:
     laser_sigma_rad: float = 0.02
     laser_latency_sigma_s: float = 0.05
     sighting_latency_sigma_s: float = 0.2
+    sighting_sigma_rad: float = 0.05
+    sighting_scale_sigma: float = 0.03
     commanded_velocities: bool = False
     parameter_noise: Literal["constant", "white"] = "constant"
     turning_lever_sigma_m: float = 0.2

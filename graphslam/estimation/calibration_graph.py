@@ -35,6 +35,7 @@ from graphslam.estimation.optimisation import (
 from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
 from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
 from graphslam.estimation.sandwich_covariance import CovarianceFactors, covariance_factors
+from graphslam.estimation.solved_graph import SolvedGraph
 from graphslam.estimation.surface_bias import with_surface_bias
 from graphslam.estimation.weighed_walls import WeighedWalls
 
@@ -360,7 +361,12 @@ class CalibrationGraph:
             self._builder.weigh_walls(self._values, self.line_noise)
 
     def line_residuals(self) -> LineResiduals:
-        """Residuals of lines in the last solution.
+        """Residuals of lines in the last solution; for errors see `solved`."""
+        found = self.solved()
+        return LineResiduals(found.builder, found.values, found.root, found.calibrations)
+
+    def solved(self) -> SolvedGraph:
+        """The last solution.
 
         Raises:
             EstimationError: it is indeterminate.
@@ -373,7 +379,11 @@ class CalibrationGraph:
             raise builder.explain(error) from error
         keys = {robot: builder.state_keys(robot) for robot in builder.robots}
         marks = {number: factors.landmark_key(number) for number in builder.landmark_dims}
-        return LineResiduals(builder, self._values, information_root(rows, keys, marks))
+        free = {robot: use for robot, use in self._free.items() if len(use)}
+        own = {robot: (self._keys[robot], range(len(use))) for robot, use in free.items()}
+        root = information_root(rows, keys, marks, own)
+        priors = {r: (self._keys[r], self._priors[r].part(use)) for r, use in free.items()}
+        return SolvedGraph(builder, self._values, root, priors)
 
     def covariance_factors(self, noise: Mapping[Source, ObservationNoise]) -> CovarianceFactors:
         """See `sandwich_covariance`; of the last solution.

@@ -3,28 +3,22 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, path_length, rotate_cov, rotation3
-from graphslam.core.information_root import InformationRoot
 from graphslam.core.observation_models import LineModel
 from graphslam.estimation import factors
 from graphslam.estimation.isam2 import observed_ends
 from graphslam.estimation.joint_covariances import covariance_of
 from graphslam.estimation.posterior_residuals import Residuals
-from graphslam.estimation.recorded_graph import RecordedGraph
+from graphslam.estimation.solved_graph import SolvedGraph
 from graphslam.estimation.weighed_walls import WeighedWalls, weighed_walls
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LineResiduals:
-    """A solution: its graph, values and the root of its information."""
-
-    builder: RecordedGraph
-    values: gtsam.Values
-    root: InformationRoot
+class LineResiduals(SolvedGraph):
+    """Residuals of the lines in a solution."""
 
     @property
     def robots(self) -> Sequence[str]:

@@ -119,7 +119,7 @@ def _error_root(
     for source, seen in sources.items():
         rows = slice(first, first := first + 2 * len(seen))
         if source in noise:
-            alone, shared, of = _parts([a for *_, a in seen], noise[source])
+            alone, shared, of = shared_parts([a for *_, a in seen], noise[source])
             own[rows] = alone.ravel()
             at = np.arange(rows.start, rows.stop)
             group = (2 * of[:, None] + np.arange(2)).ravel()
@@ -127,7 +127,9 @@ def _error_root(
     return vstack([diags(own), *parts]).tocsr()
 
 
-def _parts(seen: Sequence[Association], noise: ObservationNoise) -> tuple[Array, Array, IntArray]:
+def shared_parts(
+    seen: Sequence[Association], noise: ObservationNoise
+) -> tuple[Array, Array, IntArray]:
     """Sigmas (n, 2) of the own and of the shared error, as whitened, and whose the latter is."""
     number = {target: k for k, target in enumerate(dict.fromkeys(a.target for a in seen))}
     targets = np.array([number[a.target] for a in seen], dtype=np.int64)

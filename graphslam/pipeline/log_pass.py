@@ -72,6 +72,9 @@ class LogPass:
         }
         self.kernel = config.robust  # of the final estimate
         self.noise: dict[str, Any] = {}  # of summary.json
+        #: of sensors of sightings: name -> value, which is corrected, sigma, whether it is told
+        self.sensor_errors: dict[str, tuple[float, float, bool]] = {}
+        self.sensor_warnings: list[str] = []
         self.starts = known.frame_assignment.starts
         self.frames = RobotFrames(known.frame_assignment)
         scans = any(map(log.has_scans, log.robots))

@@ -6,7 +6,7 @@ the last round.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Sighting, Step
 from graphslam.estimation.batch_calibration import ROUNDS, calibrate
+from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.estimation.log_noise import LogNoise
 from graphslam.estimation.motion_noise import noise_scales, scale_motion_noise
 from graphslam.estimation.sandwich_covariance import shared_spans, weighing_variance
@@ -44,6 +45,7 @@ def solve_sighting_log(
     config: Config,
     rounds: int = ROUNDS,
     noise: LogNoise | None = None,
+    solved_once: Callable[[CalibratedSolution, Sequence[Step]], None] | None = None,
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """Solve a log of sightings again: with the noise that it shows, and the calibration unknown.
 
@@ -55,6 +57,7 @@ def solve_sighting_log(
         config: settings.
         rounds: how often.
         noise: of the log; None takes it from the residuals of the last round but one.
+        solved_once: see `calibrate`.
 
     Returns:
         The estimate and the steps behind it.
@@ -75,7 +78,9 @@ def solve_sighting_log(
         return scale_motion_noise(made, noise_scales(made, estimate, MOTION_WINDOW_NS))
 
     shared = None if noise is None else noise.shared_errors
-    return calibrate(rebuild, estimate, tracks, config.robust, rounds, shared=shared)
+    return calibrate(
+        rebuild, estimate, tracks, config.robust, rounds, shared=shared, solved_once=solved_once
+    )
 
 
 def with_shared_errors(group: "SightingGroup", noise: LogNoise) -> "SightingGroup":

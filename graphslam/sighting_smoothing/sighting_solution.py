@@ -31,8 +31,10 @@ from graphslam.sighting_smoothing.rough_solution import (
     widened_kernel,
     with_landmarks,
 )
+from graphslam.sighting_smoothing.sensor_calibration import solved_with_sensors
 from graphslam.sighting_smoothing.sighting_noise import estimate_noise
 from graphslam.sighting_smoothing.sighting_pass import SightingPass
+from graphslam.sighting_smoothing.state_at_every_sighting import FineSolution
 from graphslam.sighting_smoothing.state_per_step import sighting_problem
 
 #: rounds of deciding which sightings of robots are used, and share of them that may still change:
@@ -113,10 +115,15 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    noise = estimate_noise(one.steps, one.sources, rough, one.tracks, one.config)
-    one.noise = noise.to_summary()
-    problem, start = sighting_problem(one, rough, noise, one.groups)
-    return problem.finish(one, problem.steps, start)
+
+    def solve(start: Estimate) -> FineSolution:
+        noise = estimate_noise(one.steps, one.sources, start, one.tracks, one.config)
+        one.noise = noise.to_summary()
+        problem, start = sighting_problem(one, start, noise)
+        return problem.finish(one, problem.steps, start)
+
+    found = solved_with_sensors(one, rough, solve)
+    return found.estimate, found.steps
 
 
 def with_gated_robots(one: SightingPass, rough: Estimate, made: tuple[Step, ...]) -> Estimate:

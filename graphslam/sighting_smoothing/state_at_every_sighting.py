@@ -11,6 +11,7 @@ from graphslam.estimation.batch_calibration import calibrate
 from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.estimation.log_noise import LogNoise, weighed, with_own_noise
 from graphslam.estimation.motion_noise import scale_motion_noise
+from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.sighting_smoothing.sensor_latency import (
@@ -25,6 +26,37 @@ from graphslam.sighting_smoothing.sighting_states import (
     with_motions,
     with_states_between,
 )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FineSolution:
+    """The final solution of a log: the estimate, the steps behind it, and what was solved.
+
+    ``shared``: noise of sightings that share errors.
+    """
+
+    estimate: Estimate
+    steps: tuple[Step, ...]
+    solved: CalibratedSolution
+    made: Sequence[Step]
+    shared: Mapping[Source, ObservationNoise] | None
+
+
+class LastSolution:
+    """Keeps what `calibrate` solved last."""
+
+    def __call__(self, solved: CalibratedSolution, steps: Sequence[Step]) -> None:
+        """Keep this one."""
+        self._solved, self._steps = solved, steps
+
+    def fine(
+        self,
+        estimate: Estimate,
+        steps: tuple[Step, ...],
+        shared: Mapping[Source, ObservationNoise] | None,
+    ) -> FineSolution:
+        """What `calibrate` returned, with what is kept."""
+        return FineSolution(estimate, steps, self._solved, self._steps, shared)
 
 
 @dataclass(frozen=True)
@@ -102,15 +134,15 @@ class SightingProblem:
         """``steps`` and their estimate: there is a state wherever something was seen."""
         return with_own_noise(steps, self.noise), estimate
 
-    def finish(
-        self, one: LogPass, steps: Sequence[Step], start: Estimate
-    ) -> tuple[Estimate, tuple[Step, ...]]:
+    def finish(self, one: LogPass, steps: Sequence[Step], start: Estimate) -> FineSolution:
         """`solve`; the states of the pass ``one`` become those of ``steps``."""
         times = state_times(steps)
         for name, own in times.items():
             one.runs[name].times = own.tolist()
         one.counts["keyframes"] = sum(map(len, times.values()))
-        return self.solve(steps, start)
+        last = LastSolution()
+        found = self._solved(steps, start, rough=False, solved_once=last)
+        return last.fine(*found, self.noise.shared_errors)
 
 
 def state_at_every_sighting(

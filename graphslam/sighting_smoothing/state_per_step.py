@@ -19,6 +19,8 @@ from graphslam.sighting_smoothing.reoptimise_sightings import (
 )
 from graphslam.sighting_smoothing.sighting_states import at_states, steps_at_sightings
 from graphslam.sighting_smoothing.state_at_every_sighting import (
+    FineSolution,
+    LastSolution,
     SightingProblem,
     state_at_every_sighting,
 )
@@ -48,8 +50,16 @@ class SteppedProblem:
         Raises:
             EstimationError: the estimate is indeterminate.
         """
+        return self._solved(steps, start)
+
+    def _solved(
+        self, steps: Sequence[Step], start: Estimate, last: LastSolution | None = None
+    ) -> tuple[Estimate, tuple[Step, ...]]:
+        """`solve`; ``last`` keeps what was solved."""
         groups = [_of_steps(group, steps) for group in self.groups]
-        return solve_sighting_log(steps, start, self.tracks, groups, self.config, 1, self.noise)
+        return solve_sighting_log(
+            steps, start, self.tracks, groups, self.config, 1, self.noise, solved_once=last
+        )
 
     def at_sightings(
         self, steps: tuple[Step, ...], estimate: Estimate
@@ -62,11 +72,10 @@ class SteppedProblem:
         made = steps_at_sightings(of_points, self.sources, {}, Counter())
         return with_own_noise(made, self.noise), at_states(estimate, made, self.tracks)
 
-    def finish(
-        self, _one: LogPass, steps: Sequence[Step], start: Estimate
-    ) -> tuple[Estimate, tuple[Step, ...]]:
+    def finish(self, _one: LogPass, steps: Sequence[Step], start: Estimate) -> FineSolution:
         """`solve`."""
-        return self.solve(steps, start)
+        last = LastSolution()
+        return last.fine(*self._solved(steps, start, last), self.noise.shared_errors)
 
 
 def _of_steps(group: SightingGroup, steps: Sequence[Step]) -> SightingGroup:

@@ -14,8 +14,9 @@ from graphslam.core.records import Estimate, Step
 from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
 from graphslam.mapping.point_reassociation import PointSightings, is_point, reassociated
 from graphslam.pipeline.log_pass import LogPass
+from graphslam.sighting_smoothing.sensor_calibration import solved_with_sensors
 from graphslam.sighting_smoothing.sighting_noise import estimate_noise
-from graphslam.sighting_smoothing.state_at_every_sighting import SightingProblem
+from graphslam.sighting_smoothing.state_at_every_sighting import FineSolution, SightingProblem
 from graphslam.sighting_smoothing.state_per_step import SteppedProblem, sighting_problem
 
 #: rounds of solving and associating again: the third moves one sighting in a hundred at most
@@ -38,26 +39,44 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
     tracks = {name: run.track for name, run in one.started.items()}
     if not config.odometry.calibrate:
         return estimate, tuple(one.steps)
-    noise = estimate_noise(one.steps, one.sources, estimate, tracks, config)
-    one.noise = noise.to_summary()
-    problem, estimate = sighting_problem(one, estimate, noise)
-    steps, before = problem.steps, len(estimate.landmarks)
-    points = {
-        i
-        for i in estimate.landmarks
-        if landmarks.entries[i].identity is None and landmarks.entries[i].kind == "point"
-    }
+    before = len(estimate.landmarks)
+
+    def solve(start: Estimate) -> FineSolution:
+        noise = estimate_noise(one.steps, one.sources, start, tracks, config)
+        one.noise = noise.to_summary()
+        problem, start = sighting_problem(one, start, noise)
+        steps, start = _settled_associations(one, problem, start)
+        found = problem.finish(one, steps, start)
+        targets = {a.source: a.target for step in steps for a in step.associations}
+        one.steps = list(_retargeted(one.steps, targets))
+        return found
+
+    found = solved_with_sensors(one, estimate, solve)
+    estimate, solved = found.estimate, found.steps
+    one.counts["landmarks_merged"] += before - len(estimate.landmarks)
+    landmarks.update_from(solved, estimate)
+    _count_sightings(landmarks, solved, _unnamed_points(landmarks, estimate))
+    return estimate, solved
+
+
+def _unnamed_points(landmarks: LandmarkMap, estimate: Estimate) -> set[int]:
+    """Landmarks of an estimate that sightings may be associated with again."""
+    entries = {i: landmarks.entries[i] for i in estimate.landmarks}
+    return {i for i, one in entries.items() if one.identity is None and one.kind == "point"}
+
+
+def _settled_associations(
+    one: LogPass, problem: SightingProblem | SteppedProblem, estimate: Estimate
+) -> tuple[tuple[Step, ...], Estimate]:
+    """The steps of a problem with every sighting at the point that it fits, and their estimate."""
+    points, steps = _unnamed_points(one.landmarks, estimate), problem.steps
     for _ in range(MAX_ROUNDS if points else 0):
         estimate, _ = problem.solve(steps, estimate, rough=True)
         steps, estimate, moved, count = _associated_again(problem, steps, estimate, points)
         one.counts["observations_reassociated"] += moved
         if moved <= SETTLED_SHARE * count:
             break
-    estimate, solved = problem.finish(one, steps, estimate)
-    one.counts["landmarks_merged"] += before - len(estimate.landmarks)
-    landmarks.update_from(solved, estimate)
-    _count_sightings(landmarks, solved, points)
-    return estimate, solved
+    return steps, estimate
 
 
 def _associated_again(
@@ -86,7 +105,7 @@ def _associated_again(
     return steps, replace(estimate, landmarks=kept), moved, len(found)
 
 
-def _retargeted(steps: Sequence[Step], targets: Mapping[int | None, int]) -> tuple[Step, ...]:
+def _retargeted(steps: Sequence[Step], targets: Mapping[int | None, int | str]) -> tuple[Step, ...]:
     """Steps whose sightings are of other landmarks; ``targets`` by `Association.source`."""
     return tuple(
         replace(

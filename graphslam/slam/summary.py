@@ -132,6 +132,10 @@ def summarise(
             for name, (value, sigma, observable) in run.calibration_found(
                 {one["name"]: np.array(one["mount_in_log"]) for one in lasers[robot]}
             ).items()
+        }
+        | {
+            name: {"value": value, "sigma": sigma, "observable": observable}
+            for name, (value, sigma, observable) in pipeline.sensor_errors.items()
         },
         "lasers": lasers,
         "odometry": {
@@ -301,6 +305,7 @@ def run_warnings(pipeline: LogPass) -> list[str]:
         for name, run in pipeline.runs.items()
         if run.track.bridged
     ]
+    warnings += pipeline.sensor_warnings
     warnings += [
         f"{name}: {len(run.repeats.left_out)} scans repeat an earlier one while its odometry "
         "moves; they were left out"

@@ -2,7 +2,8 @@
 
 Where all bearings are off by one angle, so are the headings that they tell, and nothing in the
 sightings contradicts that. But then the estimated robot drives by that angle to the side of where
-its odometry says. (The mounts of lasers are calibrated.)
+its odometry says. What is left here the calibration could not take up. (The mounts of lasers are
+calibrated.) What it has taken up is doubted only if no sensor is so far off.
 """
 
 from collections.abc import Iterator
@@ -20,6 +21,9 @@ PIECE_M, LONGEST_NS = 0.3, 3_000_000_000
 PARTS, LEAST = 20, 40
 #: rad, sigmas: an angle that is told; that of healthy simulated logs is 0.03° at most
 TOLD_RAD, TOLD_SIGMAS = np.radians(1.0), 4.0
+#: errors that are corrected, rad and relative, but larger than sensors have: three of the sigmas
+#: that they are expected with
+LARGE = {"sighting_yaw_rad": 0.15, "sighting_range_scale": 0.09}
 
 
 def turned_sensor_doubts(evidence: Evidence) -> Iterator[Reason]:
@@ -41,6 +45,18 @@ def turned_sensor_doubts(evidence: Evidence) -> Iterator[Reason]:
                 "odometry drives: is the mount of its sensor right?"
             )
             yield Reason("doubtful", "sightings", robot.name, text)
+
+
+def large_error_doubts(evidence: Evidence) -> Iterator[Reason]:
+    """Sensors of sightings whose errors are corrected, but larger than they should be."""
+    for name, found in evidence.summary.get("calibration", {}).items():
+        sensor, _, error = name.rpartition(".")
+        if abs(found["value"]) > LARGE.get(error, np.inf):
+            text = (
+                f"{sensor}: its sightings fit its odometry only with {error} {found['value']:.3f}: "
+                "are the mount of its sensor and its units right?"
+            )
+            yield Reason("doubtful", "sightings", sensor, text)
 
 
 def driven_aside(times_ns: IntArray, odometry: Array, poses: Array) -> tuple[float, float] | None:

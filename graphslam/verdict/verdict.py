@@ -22,7 +22,7 @@ from graphslam.verdict.regular_landmarks import regular_landmark_doubts
 from graphslam.verdict.scan_doubts import scan_doubts
 from graphslam.verdict.sighting_doubts import sighting_doubts
 from graphslam.verdict.told_starts import contradictions
-from graphslam.verdict.turned_sensors import turned_sensor_doubts
+from graphslam.verdict.turned_sensors import large_error_doubts, turned_sensor_doubts
 from graphslam.verdict.vanished_points import vanished_doubts
 
 #: factors on a stated variance that a log shows: from the first one doubtful, from the other bad
@@ -237,6 +237,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "scans": scan_doubts,
     "sightings": sighting_doubts,
     "turned sensors": turned_sensor_doubts,
+    "sensor errors": large_error_doubts,
     "regular landmarks": regular_landmark_doubts,
     "points": vanished_doubts,
     "moved": moved_doubts,

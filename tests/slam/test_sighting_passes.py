@@ -145,9 +145,9 @@ def test_odometry_is_as_noisy_in_the_solution_per_step_as_the_log_shows(log, mon
     used = []
     solve = state_per_step.solve_sighting_log
 
-    def watched(steps, start, tracks, groups, config, rounds, noise):
+    def watched(steps, start, tracks, groups, config, rounds, noise, **others):
         used.append(({name: track.config for name, track in tracks.items()}, noise.odometry))
-        return solve(steps, start, tracks, groups, config, rounds, noise)
+        return solve(steps, start, tracks, groups, config, rounds, noise, **others)
 
     monkeypatch.setattr(state_per_step, "has_state_at_every_sighting", lambda _: False)
     monkeypatch.setattr(state_per_step, "solve_sighting_log", watched)

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import graphslam
+from graphslam.core.config import Config, OdometryConfig
 from graphslam.core.geometry import between, compose
 from graphslam.logs import LogWriter
-from graphslam.verdict.turned_sensors import LEAST, PIECE_M, TOLD_RAD, driven_aside
+from graphslam.verdict.turned_sensors import LARGE, LEAST, PIECE_M, TOLD_RAD, driven_aside
 
 S = 1_000_000_000
 
@@ -69,10 +70,17 @@ def log_of(path, off):
     return path
 
 
-def test_a_map_by_a_turned_sensor_is_doubted_and_that_of_a_true_one_is_good(tmp_path):
-    """Such maps were called good: nothing in the sightings contradicts them."""
+def test_a_turned_sensor_is_corrected_and_doubted_if_no_sensor_is_so_far_off(tmp_path):
+    """Maps by turned sensors were called good: nothing in the sightings contradicts them."""
     healthy = graphslam.smooth(log_of(tmp_path / "true.mcap", 0.0)).summary["verdict"]
     assert healthy["verdict"] == "good"
-    found = graphslam.smooth(log_of(tmp_path / "turned.mcap", 3 * TOLD_RAD)).summary["verdict"]
+    turned = log_of(tmp_path / "turned.mcap", 3 * TOLD_RAD)
+    found = graphslam.smooth(turned).summary
+    assert found["verdict"]["verdict"] == "good"
+    assert any("too far to the left" in warning for warning in found["warnings"])
+    held = Config(odometry=OdometryConfig(fixed_calibration=("sighting_yaw_rad",)))
+    found = graphslam.smooth(turned, config=held).summary["verdict"]
     assert found["verdict"] == "doubtful"
     assert any("too far to the left" in reason["text"] for reason in found["reasons"])
+    far_off = log_of(tmp_path / "far.mcap", 1.3 * LARGE["sighting_yaw_rad"])
+    assert graphslam.smooth(far_off).summary["verdict"]["verdict"] != "good"

@@ -1,0 +1,41 @@
+"""A solution of a recorded graph, as what is computed from it afterwards needs it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from graphslam.core.geometry import Array
+from graphslam.core.information_root import InformationRoot
+from graphslam.core.motion_models import Calibration
+from graphslam.estimation import factors
+from graphslam.estimation.recorded_graph import RecordedGraph
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedGraph:
+    """A graph, the values at its minimum, and the root of its information.
+
+    ``calibrations``: robot -> key of its calibration, if any of it is unknown, and what is before
+    any data. Its rows of the root are in the place of a mount's.
+    """
+
+    builder: RecordedGraph
+    values: gtsam.Values
+    root: InformationRoot
+    calibrations: Mapping[str, tuple[int, Calibration]]
+
+    def gradient(self) -> Array:
+        """That of half the squared error, (R,) by rows of the root; zero at the very minimum."""
+        builder, root, first = self.builder, self.root, dict[int, int]()
+        for robot in builder.robots:
+            first.update(zip(builder.state_keys(robot), root.states[robot].tolist(), strict=True))
+        first |= {factors.landmark_key(i): row for i, row in root.landmarks.items()}
+        first |= {key: int(root.mounts[r][0]) for r, (key, _) in self.calibrations.items()}
+        by_key = builder.graph.linearize(self.values).gradientAtZero()
+        found = np.zeros(int(root.own.sum()))
+        for key, row in first.items():
+            own = by_key.at(key)
+            found[row : row + len(own)] = own
+        return found
