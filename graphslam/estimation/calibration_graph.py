@@ -21,13 +21,13 @@ from graphslam.core.records import Estimate, Step
 from graphslam.estimation import factors
 from graphslam.estimation.backend import JointMarginal
 from graphslam.estimation.isam2 import NO_COVARIANCES, with_means
-from graphslam.estimation.joint_covariances import information_root, solve_root
+from graphslam.estimation.joint_covariances import solve_root
 from graphslam.estimation.line_noise import fit_line_noise
 from graphslam.estimation.line_residuals import LineResiduals
 from graphslam.estimation.motion_arrays import increments_of, linear_motions, moved_by
 from graphslam.estimation.optimisation import (
     CONVERGED_ERROR_ROUGH,
-    joint_marginal_by_qr,
+    JointMarginals,
     marginals_of,
     reweighted,
     root_of,
@@ -134,7 +134,7 @@ class CalibrationGraph:
         self._builder = builder = RecordedGraph(kernel, noise)
         self._values, self._priors = gtsam.Values(), priors
         # at the last solution, as is the error of the graph that was solved
-        self._marginals: gtsam.Marginals | None = None
+        self._marginals: JointMarginals | None = None
         self._error = 0.0
         self.line_noise: Mapping[str, Array] = {}
         self._steps = steps
@@ -142,16 +142,15 @@ class CalibrationGraph:
         self._now = now  # by what they were computed
         self._linear_at: gtsam.Values | None = None  # the solution around which they are linear
         self._keys = {r: int(gtsam.symbol("c", k)) for k, r in enumerate(sorted(priors))}
-        self._free = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
+        unknown = {r: np.flatnonzero(np.diag(c.cov) > HELD_SIGMA**2) for r, c in priors.items()}
+        self._free = {robot: use for robot, use in unknown.items() if len(use)}
         self._motions: dict[str, list[tuple[int, int, int]]] = defaultdict(list)  # index, two keys
-        for robot, prior in priors.items():
-            key, use = self._keys[robot], self._free[robot]
-            if len(use):
-                self._values.insert(key, now[robot].mean[use])
-                model = factors.gaussian(prior.cov[np.ix_(use, use)])
-                builder.graph.add(gtsam.PriorFactorVector(key, prior.mean[use], model))
-        free = [robot for robot, use in self._free.items() if calibrated and len(use)]
-        builder.insert_all(steps, start, self._values, free)
+        for robot, use in self._free.items():
+            key, prior = self._keys[robot], priors[robot].part(use)
+            self._values.insert(key, now[robot].mean[use])
+            model = factors.gaussian(prior.cov)
+            builder.graph.add(gtsam.PriorFactorVector(key, prior.mean, model))
+        builder.insert_all(steps, start, self._values, list(self._free) if calibrated else [])
         builder.rebuild_lines(self._values)
         for index, robot, last, key in builder.motions:
             self._motions[robot].append((index, last, key))
@@ -174,8 +173,6 @@ class CalibrationGraph:
         unit = gtsam.noiseModel.Unit.Create(3)
         self._made, self._now, self._linear_at = made, now, values
         for robot, use in self._free.items():
-            if not len(use):
-                continue
             values.update(self._keys[robot], now[robot].mean[use])
             if robot not in made:
                 continue
@@ -274,9 +271,9 @@ class CalibrationGraph:
         """The calibrations where it was optimised last, with those covariances that are known."""
         calibrations = {}
         for robot, prior in self._priors.items():
-            mean, cov, use = prior.mean.copy(), prior.cov.copy(), self._free[robot]
-            if len(use):
-                key = self._keys[robot]
+            mean, cov = prior.mean.copy(), prior.cov.copy()
+            if robot in self._free:
+                key, use = self._keys[robot], self._free[robot]
                 mean[use] = self._values.atVector(key)
                 cov[np.ix_(use, use)] = covs.get(key, np.nan)
             calibrations[robot] = Calibration(prior.names, mean, cov)
@@ -303,8 +300,8 @@ class CalibrationGraph:
     def _mount_places(self) -> dict[str, tuple[int, list[int]]]:
         """Robots whose mounts are estimated, see `information_root`."""
         found = {}
-        for robot, prior in self._priors.items():
-            names = [prior.names[k] for k in self._free[robot]]
+        for robot, use in self._free.items():
+            names = [self._priors[robot].names[k] for k in use]
             at = [names.index(name) if name in names else -1 for name in MOUNT_NAMES]
             if max(at) >= 0:
                 found[robot] = (self._keys[robot], at)
@@ -342,7 +339,7 @@ class CalibrationGraph:
         """
         builder = self._builder
         self._relinearise()
-        free = {robot: (self._keys[robot], use) for robot, use in self._free.items() if len(use)}
+        free = {robot: (self._keys[robot], use) for robot, use in self._free.items()}
         pairs = posterior_pairs(builder, free, over_spans)
         try:
             blocks = marginals_of(builder.graph, self._values, *pairs)
@@ -377,13 +374,8 @@ class CalibrationGraph:
             rows = root_of(builder.graph, self._values)
         except RuntimeError as error:
             raise builder.explain(error) from error
-        keys = {robot: builder.state_keys(robot) for robot in builder.robots}
-        marks = {number: factors.landmark_key(number) for number in builder.landmark_dims}
-        free = {robot: use for robot, use in self._free.items() if len(use)}
-        own = {robot: (self._keys[robot], range(len(use))) for robot, use in free.items()}
-        root = information_root(rows, keys, marks, own)
-        priors = {r: (self._keys[r], self._priors[r].part(use)) for r, use in free.items()}
-        return SolvedGraph(builder, self._values, root, priors)
+        priors = {r: (self._keys[r], self._priors[r].part(use)) for r, use in self._free.items()}
+        return SolvedGraph.of(builder, self._values, rows, priors)
 
     def covariance_factors(self, noise: Mapping[Source, ObservationNoise]) -> CovarianceFactors:
         """See `sandwich_covariance`; of the last solution.
@@ -404,13 +396,12 @@ class CalibrationGraph:
         """
         covs = {robot: prior.cov.copy() for robot, prior in self._priors.items()}
         for robot, use in self._free.items():
-            if len(use):
-                key = self._keys[robot]
-                if posterior is None:
-                    own = self._joint_covariance([key])
-                else:
-                    own = posterior.blocks.marginals[key]
-                covs[robot][np.ix_(use, use)] = own
+            key = self._keys[robot]
+            if posterior is None:
+                own = self._joint_covariance([key])
+            else:
+                own = posterior.blocks.marginals[key]
+            covs[robot][np.ix_(use, use)] = own
         return covs
 
     def landmark_covariance(self, landmarks: Sequence[int]) -> Array:
@@ -431,17 +422,12 @@ class CalibrationGraph:
 
     def _joint_covariance(self, keys: Sequence[int]) -> Array:
         """Joint covariance (D, D) of variables at the last solution, in their own axes."""
-        if self._marginals is None:
-            self._relinearise()
-        graph, values = self._builder.graph, self._values
         try:
-            self._marginals = self._marginals or gtsam.Marginals(graph, values)
-            return np.asarray(self._marginals.jointMarginalCovariance(list(keys)).fullMatrix())
-        except RuntimeError as failed:
-            error = failed
-        try:
-            return joint_marginal_by_qr(graph, values, keys)
-        except RuntimeError:
+            if self._marginals is None:
+                self._relinearise()
+                self._marginals = JointMarginals(self._builder.graph, self._values)
+            return self._marginals.of(keys)
+        except RuntimeError as error:
             raise self._builder.explain(error) from error
 
 

@@ -278,28 +278,39 @@ def joint_marginal(tree: gtsam.ISAM2 | gtsam.GaussianBayesTree, keys: list[int])
     return np.asarray(tree.jointMarginalCovariance(keys).fullMatrix())
 
 
-def joint_marginal_by_qr(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Sequence[int]
-) -> Array:
-    """Joint marginal covariance (D, D) of a few variables in this order, where Cholesky fails.
+class JointMarginals:
+    """Joint covariances of a few variables of a graph: by Cholesky, or by QR where that fails."""
 
-    They are eliminated last: their own conditionals are the root of their information.
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """At ``values``."""
+        self._graph, self._values = graph, values
+        self._by_cholesky: gtsam.Marginals | None = None
 
-    Raises:
-        RuntimeError: it is indeterminate.
-    """
-    linear = graph.linearize(values)
-    last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, list(keys), True)
-    every = linear.eliminateSequential(last, gtsam.EliminateQR)
-    own = gtsam.GaussianBayesNet()
-    for n in range(every.size() - len(keys), every.size()):
-        own.push_back(every.at(n))
-    R, _ = own.matrix()
-    try:
+    def of(self, keys: Sequence[int]) -> Array:
+        """The joint covariance (D, D) of variables in this order, in their own axes.
+
+        Raises:
+            RuntimeError: it is indeterminate.
+        """
+        try:
+            found = self._by_cholesky or gtsam.Marginals(self._graph, self._values)
+            self._by_cholesky = found
+            return np.asarray(found.jointMarginalCovariance(list(keys)).fullMatrix())
+        except RuntimeError as failed:
+            error = failed  # it names the variable
+        R = self._root(keys)
+        # QR does not fail on an indeterminate graph, its root is singular or not finite
+        if not (np.isfinite(R).all() and np.diagonal(R).all()):
+            raise error
         inverse = np.linalg.inv(R)
-    except np.linalg.LinAlgError as error:
-        raise RuntimeError("indeterminate") from error
-    # QR does not fail on an indeterminate graph, its root is not finite
-    if not np.isfinite(inverse).all():
-        raise RuntimeError("indeterminate")
-    return np.asarray(inverse @ inverse.T)
+        return np.asarray(inverse @ inverse.T)
+
+    def _root(self, keys: Sequence[int]) -> Array:
+        """Root (D, D) of the information of variables, which are eliminated last, by QR."""
+        linear = self._graph.linearize(self._values)
+        last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, list(keys), True)
+        every = linear.eliminateSequential(last, gtsam.EliminateQR)
+        own = gtsam.GaussianBayesNet()
+        for n in range(every.size() - len(keys), every.size()):
+            own.push_back(every.at(n))
+        return np.asarray(own.matrix()[0])

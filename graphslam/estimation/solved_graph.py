@@ -1,6 +1,6 @@
 """A solution of a recorded graph, as what is computed from it afterwards needs it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -10,7 +10,9 @@ from graphslam.core.geometry import Array
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.motion_models import Calibration
 from graphslam.estimation import factors
+from graphslam.estimation.joint_covariances import information_root
 from graphslam.estimation.recorded_graph import RecordedGraph
+from graphslam.estimation.selected_inverse import CliqueRows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,6 +27,20 @@ class SolvedGraph:
     values: gtsam.Values
     root: InformationRoot
     calibrations: Mapping[str, tuple[int, Calibration]]
+
+    @classmethod
+    def of(
+        cls,
+        builder: RecordedGraph,
+        values: gtsam.Values,
+        rows: Sequence[CliqueRows],
+        calibrations: Mapping[str, tuple[int, Calibration]],
+    ) -> "SolvedGraph":
+        """Of the ``rows`` of the root, as they were eliminated."""
+        keys = {robot: builder.state_keys(robot) for robot in builder.robots}
+        marks = {number: factors.landmark_key(number) for number in builder.landmark_dims}
+        own = {robot: (key, range(len(prior.cov))) for robot, (key, prior) in calibrations.items()}
+        return cls(builder, values, information_root(rows, keys, marks, own), calibrations)
 
     def gradient(self) -> Array:
         """That of half the squared error, (R,) by rows of the root; zero at the very minimum."""
