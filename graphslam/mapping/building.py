@@ -17,7 +17,7 @@ from graphslam.mapping.landmark_map import Entry
 #: m: what is longer belongs to the building
 LONGEST_M = 2.5
 #: m, rad, m: pieces of one plane are off each other by less, and nearer to each other
-PLANE_M, PLANE_RAD, GAP_M = 0.03, 0.05, 3.0
+PLANE_M, PLANE_RAD, GAP_M = 0.02, 0.05, 5.0
 
 
 def of_building(walls: Sequence[Entry]) -> BoolArray:
@@ -26,12 +26,11 @@ def of_building(walls: Sequence[Entry]) -> BoolArray:
         return np.zeros(0, dtype=np.bool_)
     x, extents = np.array([w.mean for w in walls]), np.array([w.extent for w in walls])
     i, j = near_pairs(x, extents, np.zeros(len(x), dtype=np.bool_), GAP_M)
-    there, back = between(x[i], x[j]), between(x[j], x[i])
-    off = np.maximum(
-        np.abs(there[:, 1] + extents[j].mean(axis=1) * np.sin(there[:, 2])),
-        np.abs(back[:, 1] + extents[i].mean(axis=1) * np.sin(back[:, 2])),
-    )
-    one = (off < PLANE_M) & (np.abs(there[:, 2]) < PLANE_RAD)
+    longer = np.ptp(extents[i], axis=1) >= np.ptp(extents[j], axis=1)
+    i, j = np.where(longer, i, j), np.where(longer, j, i)
+    there = between(x[i], x[j])  # the direction of a short piece tells little of where others are
+    off = there[:, 1] + extents[j].mean(axis=1) * np.sin(there[:, 2])
+    one = (np.abs(off) < PLANE_M) & (np.abs(there[:, 2]) < PLANE_RAD)
     n = len(x)
     pairs = coo_matrix((np.ones(one.sum()), (i[one], j[one])), shape=(n, n))
     _, plane = connected_components(pairs, directed=False)

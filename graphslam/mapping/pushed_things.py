@@ -39,12 +39,16 @@ from graphslam.mapping.wall_observations import (
 AROUND_M, PIECE_M = 8.0, 4.0
 #: m: sigma across of what is seen again, at first, at least and at most
 REPEATED_M, LEAST_REPEATED_M, MOST_REPEATED_M = 0.008, 0.004, 0.02
+#: m: sigma of a wall of an earlier map, at least
+SEEN_M = 0.001
 #: m, m, rad: sigmas of a motion before anything is compared
 FREE = np.array([0.1, 0.1, 0.02])
 #: two motions that differ by more are not one
 GATE = chi2_quantile(0.999, 3)
 #: m: things that were pushed by less are left as they are
 LEAST_PUSHED_M = 0.01
+#: things near each other that were pushed, at least
+LEAST_ALIKE = 3
 #: pieces of the building that tell a motion, and what is around a thing that tells what is left
 LEAST_PIECES, LEAST_AROUND = 3, 6
 #: rounds of weights of a motion, and the squared distance of which a piece counts a quarter
@@ -56,6 +60,7 @@ def part_pushed(
     estimate: Estimate,
     landmarks: LandmarkMap,
     known: KnownLandmarks | None = None,
+    least: int = LEAST_ALIKE,
 ) -> tuple[tuple[Step, ...], Estimate, dict[int, int]]:
     """Steps in which what was pushed between visits is another landmark from then on.
 
@@ -71,7 +76,7 @@ def part_pushed(
     seen = walls_seen(steps, estimate, ("line", "segment"))
     places: dict[int, tuple[list[Association], list[Association]]] = {}
     pushed = {
-        visit: _pushed(compared)
+        visit: _pushed(compared, least)
         for visit, compared in _visits(seen, estimate, landmarks, before)
         if len(compared.wall)
     }
@@ -160,13 +165,13 @@ def _around(c: _Compared) -> Iterator[_Around]:
         yield _Around(row, *motions, spread if len(left) >= 2 * LEAST_AROUND else np.nan)
 
 
-def _pushed(c: _Compared) -> set[int]:
+def _pushed(c: _Compared, least: int) -> set[int]:
     """The walls of a visit that were pushed before it."""
     left = np.array([around.left_m for around in _around(c)])
     if np.isfinite(left).any():
         repeated = np.clip(np.nanmedian(left), LEAST_REPEATED_M, MOST_REPEATED_M)
         c = replace(c, repeated_m=float(repeated))
-    pushed, W = set(), c.information
+    W, alike = c.information, np.zeros(len(c.wall), dtype=np.bool_)
     for row, (stays, P), (moves, Q), _ in _around(c):
         apart = moves - stays
         J = c.jacobians(c.at[row])[row]
@@ -174,9 +179,11 @@ def _pushed(c: _Compared) -> set[int]:
         if apart @ np.linalg.solve(P + Q, apart) <= GATE or abs(by[0]) < LEAST_PUSHED_M:
             continue
         own = c.off[row] - J @ stays
-        if (own - by) @ W[row] @ (own - by) < own @ W[row] @ own:
-            pushed.add(int(c.wall[row]))
-    return pushed
+        alike[row] = (own - by) @ W[row] @ (own - by) < own @ W[row] @ own
+    # a few do not drag a path, and by themselves are told better
+    rows = np.flatnonzero(alike)
+    near = np.hypot(*(c.at[rows, None] - c.at[rows]).T) <= AROUND_M
+    return set(c.wall[rows[near.sum(axis=0) >= least]].tolist())
 
 
 def _visits(
@@ -201,7 +208,11 @@ def _visits(
                 own = all_of_it.only((all_of_it.robot == visit) & (piece == part))
                 at = float(own.along.mean())
                 if number in before:
-                    there = _moved_along(before[number][0][1:], before[number][1][1:, 1:], at)
+                    across, cov = before[number][0][1:], before[number][1].diagonal()[1:]
+                    # without the bias of its surface, which is in what the motions leave
+                    unbiased = max(cov[0] - landmarks.bias_m**2, SEEN_M**2)
+                    cov = np.diag([unbiased, cov[1]])
+                    there = _moved_along(across, cov, at)
                 else:
                     first = (all_of_it.robot == names[0]) & (piece == part)
                     if not first.any():

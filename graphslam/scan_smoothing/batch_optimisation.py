@@ -44,7 +44,7 @@ from graphslam.mapping.landmark_map import mean_landmarks
 from graphslam.mapping.loop_closure import Tamper, fix_position
 from graphslam.mapping.loose_returns import with_loose_returns
 from graphslam.mapping.moved_walls import part_moved
-from graphslam.mapping.pushed_things import part_pushed
+from graphslam.mapping.pushed_things import LEAST_ALIKE, part_pushed
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import closures_not_in_landmarks
 from graphslam.mapping.visits import tie_visits
@@ -266,9 +266,12 @@ def _without_pushed(
     and the new landmarks -> those that they were.
     """
     landmarks, moved = scan_log.landmarks, dict[int, int]()
+    known = scan_log.steps[0].known
     for _ in range(PUSHED_ROUNDS):
         landmarks.update_from(steps, found)
-        steps, found, made = part_pushed(steps, found, landmarks, scan_log.steps[0].known)
+        # once some were pushed, others were as well
+        least = 1 if moved else LEAST_ALIKE
+        steps, found, made = part_pushed(steps, found, landmarks, known, least)
         if not made:
             break
         moved |= made
