@@ -70,7 +70,7 @@ def part_moved(
     places = {}
     for wall, seen in walls_seen(steps, estimate, ("line", "segment")).items():
         mean = estimate.landmarks[wall][0]
-        # what two visits say of the direction of a long wall is worth more than one that moved costs
+        # what visits say of the direction of a long wall is worth more than one that moved costs
         if _length(wall, wall_observations(seen, estimate, mean), landmarks) > LONGEST_M:
             continue
         prior = _Line(before[wall][0][1:], before[wall][1][1:, 1:]) if wall in before else None

@@ -50,7 +50,9 @@ LEAST_PUSHED_M = 0.01
 #: things near each other that were pushed, at least
 LEAST_ALIKE = 3
 #: pieces of the building that tell a motion, and what is around a thing that tells what is left
-LEAST_PIECES, LEAST_AROUND = 3, 6
+LEAST_PIECES, LEAST_AROUND = 3, 12
+#: sigma of a normal distribution by the median of its absolute values
+MEDIAN_SIGMA = 1.4826
 #: rounds of weights of a motion, and the squared distance of which a piece counts a quarter
 ROUNDS, HALF_D2 = 4, 9.0
 
@@ -152,17 +154,19 @@ def _around(c: _Compared) -> Iterator[_Around]:
     tree = cKDTree(c.at)
     for row in np.flatnonzero(~c.stays).tolist():
         near = np.array(tree.query_ball_point(c.at[row], AROUND_M))
-        groups = [c.only(near[c.stays[near]]), c.only(near[~c.stays[near]])]
-        if len(groups[0].wall) < LEAST_PIECES:
+        building, things = c.only(near[c.stays[near]]), c.only(near[~c.stays[near]])
+        if len(building.wall) < LEAST_PIECES:
             continue
-        motions = [group.motion(c.at[row]) for group in groups]
+        stays, moves = building.motion(c.at[row]), things.motion(c.at[row])
         left = np.concatenate([
-            (g.off - g.jacobians(c.at[row]) @ motion)[:, 0]
-            for g, (motion, _) in zip(groups, motions, strict=True)
+            (group.off - group.jacobians(c.at[row]) @ motion)[:, 0]
+            for group, (motion, _) in ((building, stays), (things, moves))
         ])  # fmt: skip
-        # a motion fits three of its pieces whatever they are
-        spread = 1.4826 * float(np.median(np.abs(left))) * np.sqrt(len(left) / max(len(left) - 6, 1))
-        yield _Around(row, *motions, spread if len(left) >= 2 * LEAST_AROUND else np.nan)
+        left_m = np.nan
+        if len(left) >= LEAST_AROUND:  # each motion fits three pieces whatever they are
+            factor = MEDIAN_SIGMA * np.sqrt(len(left) / (len(left) - 6))
+            left_m = float(factor * np.median(np.abs(left)))
+        yield _Around(row, stays, moves, left_m)
 
 
 def _pushed(c: _Compared, least: int) -> set[int]:
@@ -195,45 +199,74 @@ def _visits(
     """Each visit, compared with the first one that saw a wall, or with an earlier map."""
     walls = [landmarks.entries[n] for n in seen]
     stays = dict(zip(seen, of_building(walls).tolist(), strict=True))
-    found: dict[str, list[tuple[Array, Array, Array, Array, int, bool]]] = {}
+    found: dict[str, list[_Piece]] = {}
     for number, every in seen.items():
         mean = estimate.landmarks[number][0]
-        all_of_it = wall_observations(every, estimate, mean)
+        of_all = wall_observations(every, estimate, mean)
+        known = None
+        if number in before:
+            across, cov = before[number][0][1:], before[number][1].diagonal()[1:]
+            # without the bias of its surface, which is in what the motions leave
+            own = max(cov[0] - landmarks.bias_m**2, SEEN_M**2)
+            known = across, np.diag([own, cov[1]])
         names = sorted({a.robot for a in every}, key=lambda name: _began(estimate, name))
-        if number not in before and len(names) < 2:
-            continue
-        piece = np.floor(all_of_it.along / PIECE_M) * stays[number]
-        for visit in names if number in before else names[1:]:
-            for part in np.unique(piece[all_of_it.robot == visit]):
-                own = all_of_it.only((all_of_it.robot == visit) & (piece == part))
-                at = float(own.along.mean())
-                if number in before:
-                    across, cov = before[number][0][1:], before[number][1].diagonal()[1:]
-                    # without the bias of its surface, which is in what the motions leave
-                    unbiased = max(cov[0] - landmarks.bias_m**2, SEEN_M**2)
-                    cov = np.diag([unbiased, cov[1]])
-                    there = _moved_along(across, cov, at)
-                else:
-                    first = (all_of_it.robot == names[0]) & (piece == part)
-                    if not first.any():
-                        continue
-                    there = _line_at(all_of_it.only(first), at)
-                line, cov = _line_at(own, at)
-                normal = unit_vectors(mean[2] + np.pi / 2)
-                place = mean[:2] + at * unit_vectors(mean[2])
-                found.setdefault(visit, []).append(
-                    (place, normal, line - there[0], cov + there[1], number, stays[number])
-                )
-    for visit, rows in found.items():
-        yield visit, _Compared(*map(np.array, zip(*rows, strict=True)))
+        length = PIECE_M if stays[number] else np.inf
+        for visit in names[known is None :]:
+            for piece in _pieces(of_all, visit, names[0], known, length):
+                at = mean[:2] + piece.along * unit_vectors(mean[2])
+                found.setdefault(visit, []).append(piece._replace(number=number, at=at))
+    for visit, pieces in found.items():
+        numbers = np.array([piece.number for piece in pieces])
+        turned = np.array([estimate.landmarks[n][0][2] for n in numbers.tolist()]) + np.pi / 2
+        yield (
+            visit,
+            _Compared(
+                np.array([piece.at for piece in pieces]), unit_vectors(turned),
+                np.array([piece.off for piece in pieces]),
+                np.array([piece.cov for piece in pieces]), numbers,
+                np.array([stays[n] for n in numbers.tolist()]),
+            ),
+        )  # fmt: skip
+
+
+class _Piece(NamedTuple):
+    """One row of `_Compared`, of wall ``number``, ``along`` m from its mean."""
+
+    along: float
+    off: Array
+    cov: Array
+    number: int = -1
+    at: Array = np.zeros(2)
+
+
+def _pieces(
+    of_all: WallObservations,
+    visit: str,
+    first: str,
+    known: tuple[Array, Array] | None,
+    length: float,
+) -> Iterator[_Piece]:
+    """A wall as a visit saw it, against the ``first`` one or what is ``known`` of it.
+
+    Piece by piece, each of a ``length``, m.
+    """
+    number = np.floor(of_all.along / length)
+    for k in np.unique(number[of_all.robot == visit]):
+        own = of_all.only((of_all.robot == visit) & (number == k))
+        at = float(own.along.mean())
+        there = known
+        if there is None:
+            others = (of_all.robot == first) & (number == k)
+            if not others.any():
+                continue
+            there = of_all.only(others).line()
+        line, cov = _moved_along(*own.line(), at)
+        before, cov_before = _moved_along(*there, at)
+        yield _Piece(at, line - before, cov + cov_before)
 
 
 def _began(estimate: Estimate, name: str) -> tuple[int, str]:
     return int(estimate.states[name].stamps_ns[0]), name
-
-
-def _line_at(wall: WallObservations, at: float) -> tuple[Array, Array]:
-    return _moved_along(*wall.line(), at)
 
 
 def _moved_along(line: Array, cov: Array, at: float) -> tuple[Array, Array]:
