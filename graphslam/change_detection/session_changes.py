@@ -51,7 +51,7 @@ def _changes(result: Result, before: str, later: str) -> dict[str, Any] | None:
         return None
     entry = {"session": later, "since": before}
     try:
-        found = detect_changes(a, b, result.config.changes, identity_registration(a))
+        found = detect_changes(a, b, result.config.changes, identity_registration(a), one_map=True)
     except OutputError as error:
         return entry | {"changes": [], "warnings": [str(error)]}
     # keyframes have their returns only: how many they are does not tell two lasers apart
