@@ -211,6 +211,10 @@ def smooth(
         with checkpoint(output, log, settled, earlier, resume=resume) as kept:
             truth = None if output is None else truth_later(log)
             result = smooth(log, settled, of_all(log, progress), None, ahead, kept, earlier)
+            if settled.logs.same_place:
+                from graphslam.change_detection.session_changes import with_session_changes
+
+                result = with_session_changes(result)
             if output is not None and truth is not None:
                 announce("report")
                 errors = errors_of_run(result, truth.result())

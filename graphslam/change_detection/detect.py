@@ -19,7 +19,12 @@ from graphslam.change_detection.alignment import (
     laser_warnings,
     settings_for_noise,
 )
-from graphslam.change_detection.beam_evidence import BeamEvidence, null_sigma, repeatability
+from graphslam.change_detection.beam_evidence import (
+    DOUBTFUL_SIGMA,
+    BeamEvidence,
+    null_sigma,
+    repeatability,
+)
 from graphslam.change_detection.objects import (
     Change,
     Lines,
@@ -101,10 +106,14 @@ def detect_changes(
     later: Visit,
     config: ChangesConfig,
     registration: Registration | None = None,
+    *,
+    one_map: bool = False,
 ) -> ChangeResult:
     """Find what changed between two visits, each in its own world frame.
 
     ``registration`` of the later frame in the reference's is by default found from both maps.
+    ``one_map``: the two were solved together, so that most may have changed and nothing else
+    explains that.
 
     Raises:
         OutputError: the two cannot be registered, or have nothing in common.
@@ -121,13 +130,14 @@ def detect_changes(
     if aligned.nonrigid:
         warnings += (_NONRIGID,)
     # before transparent surfaces are left out: in maps that disagree most surfaces seem so
-    warnings += consistency_warnings(aligned)
+    if not one_map or not aligned.is_inconsistent:
+        warnings += consistency_warnings(aligned)
     a, b = surfaces = without_transparent(aligned.surfaces, (reference, later), config)
     on_a, on_b = evidence = tuple(
         replace(e, tested=e.tested & s.good)
         for e, s in zip(aligned.evidence, surfaces, strict=True)
     )
-    sigma = null_sigma(evidence)
+    sigma = min(null_sigma(evidence), DOUBTFUL_SIGMA if one_map else np.inf)
     compared, flagged = _classify_beams(later, b, (on_a, on_b), sigma, config)
     ended = np.nonzero(b.beams >= 0)[0]
     vanished = find_regions(a, on_a, on_a.beams, on_a.rows, on_a.first_ns, sigma, config)

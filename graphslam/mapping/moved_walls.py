@@ -6,6 +6,7 @@ where it never stood. Once all is solved, what each visit saw of it shows a line
 """
 
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from graphslam.core.geometry import Array, compose, exp
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step
+from graphslam.mapping.building import LONGEST_M
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.mapping.wall_observations import (
     PATH_M,
@@ -27,9 +29,6 @@ from graphslam.mapping.wall_observations import (
 
 #: two lines that differ by more are not of one thing at one place
 GATE = chi2_quantile(0.99, 2)
-#: m: what is longer belongs to the building. What two visits say of the direction of a long wall
-#: is worth more than one that was moved costs
-LONGEST_M = 2.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,13 +67,39 @@ def part_moved(
     before = {} if known is None else known.given_the_others(estimate.landmarks)
     if not before and len(estimate.states) < 2:
         return steps, estimate, {}
-    marks, targets, made = dict(estimate.landmarks), dict[int, int](), dict[int, int]()
+    places = {}
     for wall, seen in walls_seen(steps, estimate, ("line", "segment")).items():
-        mean = marks[wall][0]
+        mean = estimate.landmarks[wall][0]
+        # what visits say of the direction of a long wall is worth more than one that moved costs
         if _length(wall, wall_observations(seen, estimate, mean), landmarks) > LONGEST_M:
             continue
         prior = _Line(before[wall][0][1:], before[wall][1][1:, 1:]) if wall in before else None
-        stayed, *moved = _places(seen, estimate, mean, prior, landmarks.bias_m)
+        places[wall] = _places(seen, estimate, mean, prior, landmarks.bias_m)
+    return separated(steps, estimate, landmarks, places, before)
+
+
+def separated(
+    steps: tuple[Step, ...],
+    estimate: Estimate,
+    landmarks: LandmarkMap,
+    places: Mapping[int, Sequence[Sequence[Association]]],
+    before: Mapping[int, tuple[Array, Array]],
+) -> tuple[tuple[Step, ...], Estimate, dict[int, int]]:
+    """Steps in which walls are a landmark for each of their ``places``, the first one as it was.
+
+    Args:
+        steps: with observations of the walls.
+        estimate: of all states and landmarks.
+        landmarks: the map, which gets the new ones.
+        places: wall -> its observations at each place.
+        before: of walls of an earlier map, see `KnownLandmarks.given_the_others`.
+
+    Returns:
+        As `part_moved`.
+    """
+    marks, targets, made = dict(estimate.landmarks), dict[int, int](), dict[int, int]()
+    for wall, (stayed, *moved) in places.items():
+        mean = marks[wall][0]
         for part in moved:
             number = landmarks.next_number
             landmarks.split(wall, number)
@@ -84,7 +109,7 @@ def part_moved(
             made[number] = wall
         if moved:
             landmarks.recount(wall, stayed)
-            if prior is not None:
+            if wall in before:
                 marks[wall] = compose(mean, exp(before[wall][0])), marks[wall][1]
             else:
                 marks[wall] = wall_observations(stayed, estimate, mean).landmark(mean)

@@ -28,6 +28,7 @@ def page(result: Result, evaluation: Mapping[str, Any] | None) -> str:
         verdict_section(summary),
         _warnings(summary),
         _map_section(result),
+        _sessions_section(summary),
         _quality_section(evaluation or {}),
         _uncertainty_section(result),
         _estimator_section(result),
@@ -104,6 +105,10 @@ def _map_section(result: Result) -> str:
         )
     )
     return html.section("Map", live_html(live_map(result)) + html.figure_grid(figures))
+
+
+def _sessions_section(summary: Mapping[str, Any]) -> str:
+    return html.section("Between the sessions", tables.session_changes(summary))
 
 
 def _has_causal(result: Result) -> bool:

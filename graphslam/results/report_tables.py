@@ -1,4 +1,4 @@
-# ruff: noqa: RUF001 -- σ and – are meant: people read them
+# ruff: noqa: RUF001 -- σ, × and – are meant: people read them
 """Tables of the report of a result: counts, reasons, times, calibration, errors, landmarks."""
 
 from collections.abc import Mapping, Sequence
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.geometry import area_centroid
 from graphslam.core.records import Landmark, Result
 from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
 from graphslam.results.report_html import counted, duration, length, number, table
@@ -55,6 +56,30 @@ def counts(summary: Mapping[str, Any]) -> str:
     if graph:
         rows += [("graph error (½ χ²)", float(graph["error"])), ("graph dof", graph["dof"])]
     return table(["count", ""], rows, "Counts")
+
+
+def session_changes(summary: Mapping[str, Any]) -> str:
+    """What changed from each session to the next one; empty if there are no sessions."""
+    found = summary.get("sessions", {}).get("changes", ())
+    rows: list[Sequence[object]] = []
+    for one in found:
+        name = f"{one['session']}, since {one['since']}"
+        rows += [(name, *_change(change)) for change in one["changes"]]
+        if not one["changes"]:
+            rows.append((name, "nothing", "", "", ""))
+    heads = ["session", "what", "where", "size", "probability"]
+    return table(heads, rows, "What changed between the sessions") if rows else ""
+
+
+def _change(change: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    """What, where in the map, of what size, and how probable."""
+    corners = np.array(change["polygon"])
+    x, y = area_centroid(corners).tolist()
+    width, height = np.ptp(corners, axis=0).tolist()
+    return (
+        change["kind"], f"({x:.1f}, {y:.1f}) m", f"{width:.1f} × {height:.1f} m",
+        f"{change['probability']:.3f}",
+    )  # fmt: skip
 
 
 def reasons(summary: Mapping[str, Any]) -> str:

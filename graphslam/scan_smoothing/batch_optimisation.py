@@ -15,7 +15,7 @@ from graphslam.core.allocation import give_back_freed_memory
 from graphslam.core.config import Config
 from graphslam.core.motion_models import Calibration
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Step
+from graphslam.core.records import Closure, Estimate, Step
 from graphslam.core.worker import Future
 from graphslam.estimation.batch_calibration import recompute_motions
 from graphslam.estimation.calibration_graph import (
@@ -45,6 +45,7 @@ from graphslam.mapping.landmark_map import mean_landmarks
 from graphslam.mapping.loop_closure import Tamper, fix_position
 from graphslam.mapping.loose_returns import with_loose_returns
 from graphslam.mapping.moved_walls import part_moved
+from graphslam.mapping.pushed_things import LEAST_ALIKE, part_pushed
 from graphslam.mapping.reassociation import reassociate
 from graphslam.mapping.redundant_closures import closures_not_in_landmarks
 from graphslam.mapping.visits import tie_visits
@@ -62,6 +63,8 @@ CLOSED_FACTORS, SOLVED_FACTORS = (1.0, 1.0), (1 / 2, 2 / 3)
 NOISE_ROUNDS = 2
 #: states by which it is, about
 NOISE_STATES = 800
+#: times that things that were pushed alike are looked for: between more visits pushed again
+PUSHED_ROUNDS = 3
 #: peak memory from which on what closing loops has freed is half of what a process holds
 LARGE_MB = 400.0
 
@@ -209,7 +212,9 @@ def _solved(
     )
     steps = _tied(steps, rough.estimate, rough, paths, scan_log)
     found = rough.estimate
-    steps, found, scan_log.moved = part_moved(steps, found, landmarks, scan_log.steps[0].known)
+    steps, found, pushed = _without_pushed(steps, found, closures, paths, scan_log, tracks)
+    steps, found, moved = part_moved(steps, found, landmarks, scan_log.steps[0].known)
+    scan_log.moved = pushed | moved
     counts["landmarks_moved"] = len(scan_log.moved)
     steps, found = split_composites(steps, found, landmarks)
     # once landmarks of different visits are tied, most closures are no longer needed
@@ -246,6 +251,36 @@ def _solved(
     # the minimum may have turned the map as a whole: ends of walls are where they are seen there
     landmarks.update_from(steps, estimate)
     return estimate, steps
+
+
+def _without_pushed(
+    steps: tuple[Step, ...],
+    found: Estimate,
+    closures: Sequence[Closure],
+    paths: ClosedPaths,
+    scan_log: TrackedLog,
+    tracks: Mapping[str, Track],
+) -> tuple[tuple[Step, ...], Estimate, dict[int, int]]:
+    """Solved again, roughly, as long as things were pushed alike between visits.
+
+    ``found`` is of the steps. Returned are those in which such things are no ties, their estimate,
+    and the new landmarks -> those that they were.
+    """
+    landmarks, moved = scan_log.landmarks, dict[int, int]()
+    known = scan_log.steps[0].known
+    for _ in range(PUSHED_ROUNDS):
+        landmarks.update_from(steps, found)
+        # once some were pushed, others were as well
+        least = 1 if moved else LEAST_ALIKE
+        steps, found, made = part_pushed(steps, found, landmarks, known, least)
+        if not made:
+            break
+        moved |= made
+        # those that landmarks still say are between the building too: matched by what was pushed
+        kept = closures_not_in_landmarks(closures, paths.spans, steps, landmarks)
+        problem = _Problem(with_closures(steps, kept), found, tracks, scan_log.config)
+        found = problem.solve_roughly().estimate
+    return steps, found, moved
 
 
 def _count_observations(steps: tuple[Step, ...]) -> int:
