@@ -11,7 +11,10 @@ def is_interrupt(error: BaseException) -> bool:
     context, and not as its cause. Failed imports do not always state their cause.
     """
     found: BaseException | None = error
-    while found is not None and not isinstance(found, KeyboardInterrupt):
+    looked_at: list[BaseException] = []
+    # an error may be its own cause
+    while not (found is None or found in looked_at or isinstance(found, KeyboardInterrupt)):
+        looked_at.append(found)
         context = found.__context__ if isinstance(found, _OF_IMPORTS) else None
         found = found.__cause__ or context
-    return found is not None
+    return isinstance(found, KeyboardInterrupt)

@@ -17,7 +17,7 @@ from graphslam.pipeline.log_pass import Progress
 from graphslam.pipeline.robot_settings import check_robots
 from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.scan_smoothing.log_reader import Reading
-from graphslam.slam.failures import explained
+from graphslam.slam.failures import impossible_odometry
 from graphslam.slam.final_result import make_result
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.passes import run_passes
@@ -62,7 +62,9 @@ def smooth(
     try:
         result = kept.stage("result", partial(_solved, job, known_map, ahead, began))
     except EstimationError as error:
-        raise explained(error, log, config) from error
+        if found := impossible_odometry(log, config):
+            raise EstimationError(f"{error}; {'; '.join(found)}") from error
+        raise
     summary = {**result.summary, "resumed": kept.resumed}
     return replace(result, summary=summary)
 
