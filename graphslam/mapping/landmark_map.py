@@ -104,8 +104,7 @@ class LandmarkMap:
         self._tentative: dict[int, Entry] = {}
         self._unseen: dict[int, Entry] = {}
         self._next = 0
-        self._index: LandmarkIndex | None = None  # of `_indexed`, as they were then
-        self._indexed: list[Entry] = []
+        self._index: tuple[list[Entry], LandmarkIndex] | None = None  # as they were then
         self._changed: set[int] = set()  # added or extended since
 
     def __len__(self) -> int:
@@ -122,10 +121,10 @@ class LandmarkMap:
         anew where they moved; that is when their estimates are refreshed.
         """
         if self._index is None:
-            self._indexed = list(self.entries.values())
-            self._index = LandmarkIndex(*means_and_extents(self._indexed))
-        inside = self._index.touching(*box).tolist()
-        found = {self._indexed[k].id for k in inside} | self._changed
+            every = list(self.entries.values())
+            self._index = every, LandmarkIndex(*means_and_extents(every))
+        indexed, index = self._index
+        found = {indexed[k].id for k in index.touching(*box).tolist()} | self._changed
         return [self.entries[i] for i in sorted(found) if i in self.entries]
 
     def _note(self, entry: Entry) -> None:
@@ -134,7 +133,7 @@ class LandmarkMap:
             self._changed.add(entry.id)
 
     def drop_index(self) -> None:
-        """Landmarks were moved, taken in or merged: `near` looks through all of them again."""
+        """Landmarks were moved, taken in or merged, or a pass is over: `near` makes a new one."""
         self._index = None
         self._changed.clear()
 

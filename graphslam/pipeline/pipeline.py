@@ -126,6 +126,7 @@ class Pipeline(StepRecorder):
         for _ in self.process(self.messages(progress)):
             pass
         self.counts["loop_closures"] += self.associator.closures
+        self.landmarks.drop_index()
 
     def process(self, messages: Iterable[Message]) -> Iterator[Event]:
         """Take in messages, sorted by time; gives each event once it is taken in."""

@@ -14,6 +14,7 @@ from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import between, wrap
 from graphslam.core.motion_models import nominal_calibration
 from graphslam.core.records import OdometryPose, Truth
+from graphslam.estimation.sensor_errors import ERRORS
 from graphslam.logs import open_logs
 from graphslam.odometry.preintegration import Track
 from graphslam.simulation import load_scenario, simulate
@@ -136,11 +137,12 @@ def test_a_fixed_parameter_stays_and_the_others_are_found(tmp_path):
 
 
 def test_every_parameter_can_be_fixed():
-    """The names that the setting takes are those of all sources; each is then known to 1e-6."""
+    """The names that the setting takes are those of all sources, each then known to 1e-6, and
+    those of sensors of sightings."""
     config = OdometryConfig()
     sources = ("odometry", "commands", "wheels")
     names = {n for source in sources for n in nominal_calibration(source, config, True).names}
-    assert names == set(typing.get_args(CalibrationParameter))
+    assert names | set(ERRORS) == set(typing.get_args(CalibrationParameter))
     for source in sources:
         for name in nominal_calibration(source, config, True).names:
             held = nominal_calibration(source, replace(config, fixed_calibration=(name,)), True)
