@@ -20,7 +20,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from graphslam.core.arrays import BoolArray, IntArray
-from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array, unit_vectors
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.record import replace
@@ -43,8 +42,9 @@ REPEATED_M, LEAST_REPEATED_M, MOST_REPEATED_M = 0.008, 0.004, 0.02
 SEEN_M = 0.001
 #: m, m, rad: sigmas of a motion before anything is compared
 FREE = np.array([0.1, 0.1, 0.02])
-#: two motions that differ by more are not one
-GATE = chi2_quantile(0.999, 3)
+#: two motions whose squared distance is larger are not one. Six sigmas, as surfaces that are seen
+#: from the same places err alike: where nothing was pushed, distances reach five
+GATE = 36.0
 #: m: things that were pushed by less are left as they are
 LEAST_PUSHED_M = 0.01
 #: things near each other that were pushed, at least

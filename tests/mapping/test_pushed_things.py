@@ -60,7 +60,7 @@ def room(pushed_m, dragged, things=ACROSS | {10, 11}, seed=0):
     return tuple(steps), Estimate(states, marks, 0.0, 1), landmarks
 
 
-@pytest.mark.parametrize("pushed_m", [0.03, 0.05, 0.1])
+@pytest.mark.parametrize("pushed_m", [0.05, 0.1])
 @pytest.mark.parametrize("dragged", [0.0, 0.5, 1.0])
 def test_what_was_pushed_is_told_however_far_it_drags(pushed_m, dragged):
     """Dragged by all of it the walls seem to have moved: they have not. Things that face across the

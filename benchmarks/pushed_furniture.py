@@ -1,0 +1,96 @@
+"""Does furniture that was pushed between two sessions drag the second one?
+
+The simulated lab on two days. On the second all furniture stands a little aside, in one direction,
+which is drawn; both starts are told, with 2 cm and 0.3 degrees. The drag is how far the second day
+lies off in that direction, as the first day is right: mean over its poses, m. Of several seeds the
+mean and the largest, without sign, and the number of runs in which the two days are one map.
+
+Run: python benchmarks/pushed_furniture.py [--seeds N] [--first SEED] [--push M ...]
+"""
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from common import parser
+from sessions import DAY_S, SAME_PLACE, later
+
+import graphslam
+from graphslam.core.geometry import Array, transform
+from graphslam.evaluation.trajectory_metrics import align, pair_poses
+from graphslam.logs import read_truth
+from graphslam.simulation import load_scenario, simulate
+
+#: m, rad: sigmas of the told starts
+START_M, START_RAD = 0.02, 0.005
+
+
+def drag(folder: Path, seed: int, push_m: float) -> tuple[float, bool]:
+    """How far the second day lies off where things were pushed to, m; whether it was joined."""
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(-np.pi, np.pi)
+    direction = np.array([np.cos(turn), np.sin(turn)])
+    days = [day(folder, seed, k, k * push_m * direction) for k in range(2)]
+    truth = read_truth(days, SAME_PLACE).trajectories
+    sigmas = [START_M, START_M, START_RAD]
+    told = {
+        f"start.poses.{name}": (truth[name].poses[0] + rng.normal(0.0, sigmas)).tolist()
+        for name in ("day0", "day1")
+    }
+    settings = {"start.given_sigma_m": START_M, "start.given_sigma_rad": START_RAD}
+    result = graphslam.smooth(days, config=SAME_PLACE, **told, **settings)
+    first, second = (pair_poses(result.robots[d].final, truth[d]) for d in ("day0", "day1"))
+    onto: Array = align(first.estimate[:, :2], first.truth[:, :2])
+    off = transform(onto, second.estimate[:, :2]) - second.truth[:, :2]
+    return float(off.mean(axis=0) @ direction), len(set(result.summary["frames"].values())) == 1
+
+
+def day(folder: Path, seed: int, number: int, pushed: Array) -> Path:
+    """The log of a day, all boxes and boards ``pushed`` (2,), m."""
+    scenario = load_scenario("lab")
+    world = scenario.world
+    moved = {
+        kind: tuple(
+            replace(one, center_m=aside(one.center_m, pushed), may_cross=True)
+            for one in getattr(world, kind)
+        )
+        for kind in ("boxes", "boards")
+    }
+    (robot,) = scenario.robots.values()
+    made = replace(scenario, world=replace(world, **moved), robots={"robot": robot})
+    simulated = folder / "simulated.mcap"
+    simulate(made, simulated, seed=2 * seed + number)
+    path = folder / f"day{number}.mcap"
+    path.unlink(missing_ok=True)
+    later(simulated, path, DAY_S * number)
+    simulated.unlink()
+    return path
+
+
+def aside(place: tuple[float, float], pushed: Array) -> tuple[float, float]:
+    """A place (2,), pushed by (2,)."""
+    x, y = (np.array(place) + pushed).tolist()
+    return x, y
+
+
+def main() -> None:
+    """Print a row for each distance."""
+    options = parser(__doc__)
+    options.add_argument("--seeds", type=int, default=8)
+    options.add_argument("--first", type=int, default=0)
+    options.add_argument("--push", type=float, nargs="*", default=[0.0, 0.02, 0.05, 0.1])
+    chosen = options.parse_args()
+    print("| pushed, mm | mean drag, mm | largest, mm | one map |\n|---|---|---|---|")
+    for push_m in chosen.push:
+        with tempfile.TemporaryDirectory() as name:
+            seeds = range(chosen.first, chosen.first + chosen.seeds)
+            found = [drag(Path(name), seed, push_m) for seed in seeds]
+        sizes = 1e3 * np.abs([off for off, _ in found])
+        joined = sum(one for _, one in found)
+        row = f"{1e3 * push_m:.0f} | {sizes.mean():.1f} | {sizes.max():.1f}"
+        print(f"| {row} | {joined} of {len(found)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
