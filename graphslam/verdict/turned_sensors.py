@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from graphslam.core.arrays import IntArray
+from graphslam.core.config import OdometryConfig
 from graphslam.core.geometry import Array, between, path_length
 from graphslam.verdict.doubts import Reason
 from graphslam.verdict.evidence import Evidence
@@ -22,8 +23,11 @@ PARTS, LEAST = 20, 40
 #: rad, sigmas: an angle that is told; that of healthy simulated logs is 0.03° at most
 TOLD_RAD, TOLD_SIGMAS = np.radians(1.0), 4.0
 #: errors that are corrected, rad and relative, but larger than sensors have: three of the sigmas
-#: that they are expected with
-LARGE = {"sighting_yaw_rad": 0.15, "sighting_range_scale": 0.09}
+#: that they are expected with by default
+LARGE = {
+    "sighting_yaw_rad": 3 * OdometryConfig.sighting_sigma_rad,
+    "sighting_range_scale": 3 * OdometryConfig.sighting_scale_sigma,
+}
 
 
 def turned_sensor_doubts(evidence: Evidence) -> Iterator[Reason]:
