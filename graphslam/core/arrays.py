@@ -1,4 +1,4 @@
-"""Types of arrays of integers and of flags, and where flags are set.
+"""Types of arrays of integers, of complex numbers and of flags, and where flags are set.
 
 Arrays of floats are `graphslam.core.geometry.Array`.
 """
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 IntArray = np.ndarray[Any, np.dtype[np.int64]]
+ComplexArray = np.ndarray[Any, np.dtype[np.complex128]]
 BoolArray = np.ndarray[Any, np.dtype[np.bool_]]
 
 

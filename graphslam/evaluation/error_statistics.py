@@ -1,11 +1,12 @@
 """Statistics of estimation errors: root mean square, NEES with its chi-square bounds, coverage."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
+from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 
 #: probability of the ellipsoids whose coverage is counted, and the tails of the NEES' bounds
@@ -24,6 +25,22 @@ def rms(values: Array) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
+def whitened(errors: Array, covs: Array) -> Array:
+    """Errors (n, d) divided by the Cholesky roots of their covariances (n, d, d).
+
+    NaN where a covariance is not finite or not positive definite.
+    """
+    values = np.full(errors.shape, np.nan)
+    good = np.asarray(np.isfinite(covs).all(axis=(1, 2)))
+    try:
+        L = np.linalg.cholesky(covs[good])
+    except np.linalg.LinAlgError:  # says nothing of which ones
+        good[good] = np.linalg.eigvalsh(covs[good])[:, 0] > 0
+        L = np.linalg.cholesky(covs[good])
+    values[good] = np.linalg.solve(L, errors[good][..., None])[..., 0]
+    return values
+
+
 def nees(errors: Array, covs: Array) -> Array:
     """Normalised estimation error squared (n,) of errors (n, d) with covariances (n, d, d).
 
@@ -33,15 +50,11 @@ def nees(errors: Array, covs: Array) -> Array:
     Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and
     Navigation, 2001, section 5.4, DOI 10.1002/0471221279.
     """
-    values = np.full(len(errors), np.nan)
-    good = np.flatnonzero(np.isfinite(covs).all(axis=(1, 2)))
-    good = good[np.linalg.eigvalsh(covs[good])[:, 0] > 0]
-    values[good] = mahalanobis_squared(errors[good], covs[good])
-    return values
+    return np.asarray(np.square(whitened(errors, covs)).sum(axis=1))
 
 
-def effective_number(whitened: Array) -> float:
-    """How many independent errors a series of ``whitened`` ones (n, d) is worth, 1 to n.
+def effective_number(normalised: Array) -> float:
+    """How many independent errors a series of `whitened` ones (n, d) is worth, 1 to n.
 
     n / (1 + 2 sum r(k)), r(k) the correlation of the NEES at lag k. For Gaussian errors that is
     the squared Frobenius norm of the errors' own d x d correlation (Isserlis), whose mean is known
@@ -49,11 +62,11 @@ def effective_number(whitened: Array) -> float:
     ends where a pair of neighbouring lags is no longer correlated: C. Geyer, Practical Markov chain
     Monte Carlo, Statistical Science 7, 1992, DOI 10.1214/ss/1177011137 (initial positive sequence).
     """
-    n = len(whitened)
+    n = len(normalised)
     if n < 2:
         return float(n)
     padded = 1 << (2 * n - 1).bit_length()  # a transform of this length does not wrap around
-    F = np.fft.rfft(whitened, padded, axis=0)
+    F = np.fft.rfft(normalised, padded, axis=0)
     R = np.fft.irfft(F.conj()[:, :, None] * F[:, None, :], padded, axis=0)[:n]
     squares = np.square(R).sum(axis=(1, 2))
     if not squares[0] > 0:
@@ -106,7 +119,27 @@ def _verdict(mean: float, low: float, high: float) -> str:
     return TOO_CONFIDENT if mean > high else TOO_CAUTIOUS if mean < low else CONSISTENT
 
 
-def nees_statistics(errors: Sequence[Array], covs: Sequence[Array]) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True, eq=False)
+class NeesSeries:
+    """The NEES (n,) of a series of errors of ``dof`` dimensions, where it has usable covariances.
+
+    ``effective``: how many independent ones they are worth, see `effective_number`.
+    """
+
+    values: Array
+    effective: float
+    dof: int
+
+
+def nees_series(errors: Array, covs: Array) -> NeesSeries:
+    """The NEES of errors (n, d), in the order of time, with covariances (n, d, d)."""
+    found = whitened(errors, covs)
+    found = found[np.isfinite(found).all(axis=1)]
+    effective = effective_number(found) if len(found) else 0.0
+    return NeesSeries(np.square(found).sum(axis=1), effective, errors.shape[1])
+
+
+def nees_statistics(series: Sequence[NeesSeries]) -> dict[str, Any]:
     """The NEES of poses, its bounds and what they say: `NEES_NUMBERS`.
 
     The two-sided 95 % bounds, and those of 99 %, are chi-square quantiles of a mean over the
@@ -114,23 +147,11 @@ def nees_statistics(errors: Sequence[Array], covs: Sequence[Array]) -> dict[str,
     where the joint covariance is known, see `with_joint_bounds`. The verdict says what it means to
     be outside those of 95 %: covariances are `TOO_CONFIDENT` or `TOO_CAUTIOUS`, else `CONSISTENT`.
     ``coverage`` is that of the 95 % ellipsoids. Without a usable covariance all are None.
-
-    Args:
-        errors: of each series, (n, d), in the order of time.
-        covs: the same of their covariances (n, d, d), along the same axes.
     """
-    values, effective, d = [], 0.0, 1
-    for e, P in zip(errors, covs, strict=True):
-        own = nees(e, P)
-        good = np.isfinite(own)
-        if good.any():
-            d = e.shape[1]
-            values.append(own[good])
-            L = np.linalg.cholesky(P[good])
-            effective += effective_number(np.linalg.solve(L, e[good][..., None])[..., 0])
-    if not values:
+    each = np.concatenate([np.zeros(0), *(one.values for one in series)])
+    if not len(each):
         return dict.fromkeys(NEES_NUMBERS)
-    each = np.concatenate(values)
+    effective, d = sum(one.effective for one in series), series[0].dof
     mean = float(each.mean() / d)
     bounds = (chi2_quantile((*TAILS, *TAILS_99), d * effective) / (d * effective)).tolist()
     verdict = _verdict(mean, *bounds[:2])

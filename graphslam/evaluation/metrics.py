@@ -31,7 +31,12 @@ from graphslam.evaluation.relation_metrics import (
     one_after_another,
     relation_metrics,
 )
-from graphslam.evaluation.trajectory_metrics import PosePairs, pair_poses, trajectory_metrics
+from graphslam.evaluation.trajectory_metrics import (
+    PosePairs,
+    pair_poses,
+    path_errors,
+    trajectory_metrics,
+)
 from graphslam.results.folder import SavedResult
 from graphslam.results.joint_file import joint_scans
 
@@ -168,21 +173,12 @@ def _compare_trajectories(
         elsewhere: robots whose estimate is in another frame than their truth.
         joined: robots whose estimates are in one frame, whether that is the truth's or not.
     """
-    groups: dict[tuple[str | None, str], list[PosePairs]] = {
-        (name, kind): [p] for name, both in pairs.items() for kind, p in both.items()
-    }
-    in_world = [pairs[name] for name in pairs if name in joined]
-    if in_world:
-        groups |= {
-            (None, kind): [both[kind] for both in in_world]
-            for kind in in_world[0]
-            if all(kind in both for both in in_world)
-        }
-    efforts = [sum(len(one) for one in group) for group in groups.values()]
-    values = parallel_map(
-        trajectory_metrics, list(groups.values()), efforts=efforts, unit_ms=POSE_MS
-    )
-    metrics = dict(zip(groups, values, strict=True))
+    each = {(name, kind): p for name, both in pairs.items() for kind, p in both.items()}
+    own = list(each.values())
+    found_errors = parallel_map(path_errors, own, efforts=list(map(len, own)), unit_ms=POSE_MS)
+    errors = dict(zip(each, found_errors, strict=True))
+    in_world = [name for name in pairs if name in joined]
+    metrics = {key: trajectory_metrics([one]) for key, one in errors.items()}
     found: dict[str, Any] = {
         "robots": {
             name: {
@@ -194,9 +190,10 @@ def _compare_trajectories(
     }
     if in_world:
         found["joint"] = {
-            kind: metrics[None, kind] | (_WORLD_METRICS if joined <= elsewhere else {})
-            for kind in in_world[0]
-            if (None, kind) in metrics
+            kind: trajectory_metrics([errors[name, kind] for name in in_world])
+            | (_WORLD_METRICS if joined <= elsewhere else {})
+            for kind in pairs[in_world[0]]
+            if all(kind in pairs[name] for name in in_world)
         }
     return found
 

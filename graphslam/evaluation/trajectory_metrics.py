@@ -4,7 +4,7 @@ The world frame of the estimate is taken as that of the truth. What is not calle
 meaningful only where the start was given (``smooth --start truth``).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +13,12 @@ import numpy as np
 from graphslam.core.consistency import fit_rigid_transform
 from graphslam.core.geometry import Array, between, interpolate, path_length, transform, wrap
 from graphslam.core.records import Trajectory
-from graphslam.evaluation.error_statistics import nees_statistics, rms
+from graphslam.evaluation.error_statistics import NeesSeries, nees_series, nees_statistics, rms
 
 #: true poses farther apart than this in time are not interpolated between
 MAX_TRUTH_GAP_S = 1.0
+#: names of the spans of relative errors -> arguments of `relative_errors`
+SPANS: Mapping[str, Mapping[str, float]] = {"1_s": {"seconds": 1.0}, "10_m": {"metres": 10.0}}
 #: m: a path of less extent, and the share of it, left of positions, by which they tell no direction
 _STANDING_M, _NOISE_SHARE = 0.1, 0.1
 
@@ -134,7 +136,31 @@ def _aligned(distance: Array, turn: Array) -> dict[str, float | None]:
     }
 
 
-def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True, eq=False)
+class PathErrors:
+    """Errors of one robot's poses: what the numbers of one or several robots are made of.
+
+    ``estimate`` and ``truth`` (n, 3); ``errors`` (n, 3), their difference; ``relative``: name of a
+    span in `SPANS` -> `relative_errors` (k, 3) over it; ``nees``: of the poses.
+    """
+
+    estimate: Array
+    truth: Array
+    errors: Array
+    relative: Mapping[str, Array]
+    nees: NeesSeries
+
+
+def path_errors(pairs: PosePairs) -> PathErrors:
+    """The errors of one robot's poses."""
+    errors = pairs.estimate - pairs.truth
+    errors[:, 2] = wrap(errors[:, 2])
+    relative = {name: relative_errors(pairs, **span) for name, span in SPANS.items()}
+    series = nees_series(errors, pairs.covs)
+    return PathErrors(pairs.estimate, pairs.truth, errors, relative, series)
+
+
+def trajectory_metrics(robots: Sequence[PathErrors]) -> dict[str, Any]:
     """All trajectory numbers of one robot, or of several under one common alignment.
 
     Absolute errors: ``ate_rmse_m``, ``max_m`` and ``heading_rmse_rad`` as estimated, those that are
@@ -145,21 +171,16 @@ def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
     Raises:
         ValueError: there is no pair at all.
     """
-    estimate = np.concatenate([p.estimate for p in robots])
-    truth = np.concatenate([p.truth for p in robots])
+    estimate, truth, errors = (
+        np.concatenate([getattr(one, name) for one in robots])
+        for name in ("estimate", "truth", "errors")
+    )
     if not len(truth):
         raise ValueError("no pair of poses")
-    errors = estimate - truth
-    errors[:, 2] = wrap(errors[:, 2])
-    ends = np.cumsum([len(p) for p in robots])[:-1]
     distance = np.hypot(errors[:, 0], errors[:, 1])
     alignment = align_poses(estimate, truth)
     left = np.hypot(*(transform(alignment, estimate[:, :2]) - truth[:, :2]).T)
-    spans: dict[str, dict[str, float]] = {"1_s": {"seconds": 1.0}, "10_m": {"metres": 10.0}}
-    rpe = {
-        name: _rpe(np.concatenate([relative_errors(p, **span) for p in robots]))
-        for name, span in spans.items()
-    }
+    rpe = {name: _rpe(np.concatenate([one.relative[name] for one in robots])) for name in SPANS}
     return {
         "poses": len(truth),
         "ate_rmse_m": rms(distance),
@@ -167,7 +188,7 @@ def trajectory_metrics(robots: Sequence[PosePairs]) -> dict[str, Any]:
         "max_m": float(distance.max()),
         "heading_rmse_rad": rms(errors[:, 2]),
         "rpe": rpe,
-        **nees_statistics(np.split(errors, ends), [p.covs for p in robots]),
+        **nees_statistics([one.nees for one in robots]),
     }
 
 

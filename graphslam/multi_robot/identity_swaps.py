@@ -67,12 +67,17 @@ def find_swapped_identities(
             )
         return float(np.median(np.hypot(*(seen.points - position).T)))
 
+    own_m = {name: distance_m(name, name) for name in sighted}
+
+    def lies_nearer(identity: str, subject: str) -> bool:
+        """Whether the sightings of an identity are much nearer to this subject."""
+        return own_m[identity] > MIN_DISTANCE_RATIO * distance_m(identity, subject)
+
     swapped: list[tuple[str, str]] = []
     for a, b in pairs:
         if any(name in pair for pair in swapped for name in (a, b)):
             continue
-        distances = (distance_m(a, a), distance_m(a, b)), (distance_m(b, b), distance_m(b, a))
-        if all(own > MIN_DISTANCE_RATIO * other for own, other in distances):
+        if lies_nearer(a, b) and lies_nearer(b, a):
             swapped.append((a, b))
     return swapped
 
@@ -97,8 +102,7 @@ def _sighted_points(
     for sighting in sightings:
         if sighting.seen_robot or sighting.identity:
             by_robot[sighting.robot].append(sighting)
-    points: dict[str, list[Array]] = defaultdict(list)
-    times: dict[str, list[int]] = defaultdict(list)
+    found: dict[str, list[_SightedPoints]] = defaultdict(list)
     for robot, seen in by_robot.items():
         times_ns = np.array([s.time_ns for s in seen], dtype=np.int64)
         states = estimate.states[robot]
@@ -106,13 +110,17 @@ def _sighted_points(
         i = states.index_before(times_ns)
         moved = tracks[robot].motions(states.stamps_ns[i], times_ns)
         sensor = compose(compose(states.poses[i], moved.delta), np.array([s.mount for s in seen]))
-        at = MODELS["point"].invert(np.array([s.z[:2] for s in seen]), sensor)
-        for sighting, point in zip(seen, at, strict=True):
-            name = sighting.seen_robot or str(sighting.identity)
-            points[name].append(point)
-            times[name].append(sighting.time_ns)
+        points = MODELS["point"].invert(np.array([s.z[:2] for s in seen]), sensor)
+        names = np.array([s.seen_robot or s.identity for s in seen])
+        order = np.argsort(names, kind="stable")
+        different, firsts = np.unique(names[order], return_index=True)
+        for name, own in zip(different.tolist(), np.split(order, firsts[1:]), strict=True):
+            found[name].append(_SightedPoints(points[own], times_ns[own]))
     return {
-        name: _SightedPoints(np.array(points[name]), np.array(times[name], dtype=np.int64))
-        for name in points
-        if len(points[name]) >= MIN_SIGHTINGS
+        name: _SightedPoints(
+            np.concatenate([one.points for one in parts]),
+            np.concatenate([one.times_ns for one in parts]),
+        )
+        for name, parts in found.items()
+        if sum(len(one.times_ns) for one in parts) >= MIN_SIGHTINGS
     }

@@ -7,11 +7,12 @@ another unit and so on: what makes them agree is what is wrong.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.core.arrays import IntArray
-from graphslam.core.geometry import Array, between, compose, inverse, polar_points
+from graphslam.core.arrays import ComplexArray, IntArray
+from graphslam.core.geometry import Array, between
 from graphslam.verdict.doubts import Reason, seconds
 from graphslam.verdict.evidence import Evidence, RobotEvidence, Seen
 
@@ -114,34 +115,43 @@ def _pairs_of(seen: Seen) -> tuple[IntArray, IntArray]:
     return a[by_time], b[by_time]
 
 
-def _disagreement(z1: Array, z2: Array, moved: Array) -> Array:
-    """Medians (...,) of how far things are from where they were seen before, over their ranges.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """Sightings (..., n) of things, twice each, and the motion in between.
 
-    Args:
-        z1: (..., n, 2) bearings, rad, and ranges, m, from where the robot was.
-        z2: the same, of the same things, from where it is.
-        moved: (..., n, 3) motion in between.
+    ``first``, ``second``: where they were seen from the robot's earlier and later pose, x + iy, m;
+    ``to``: where the robot went, seen from its earlier pose, m; ``turn``: exp(i heading) of its
+    later pose, seen from there.
     """
-    first, second = (polar_points(z[..., 1], z[..., 0]) for z in (z1, z2))
-    expected = compose(inverse(moved), np.append(first, 0.0 * first[..., :1], axis=-1))[..., :2]
-    off = np.linalg.norm(expected - second, axis=-1) / np.maximum(z2[..., 1], 1e-9)
-    return np.asarray(np.median(off, axis=-1))
+
+    first: ComplexArray
+    second: ComplexArray
+    to: ComplexArray
+    turn: ComplexArray
+
+    @classmethod
+    def of(cls, z1: Array, z2: Array, moved: Array) -> "_Pairs":
+        """Of bearings, rad, and ranges, m, (..., n, 2) and the motions (..., n, 3) in between."""
+        first, second = (z[..., 1] * np.exp(1j * z[..., 0]) for z in (z1, z2))
+        to, turn = moved[..., 0] + 1j * moved[..., 1], np.exp(1j * moved[..., 2])
+        return cls(first, second, to, turn)
+
+    def disagreement(self, mounted: ComplexArray | complex = 1.0) -> Array:
+        """Medians (...,) of how far things are from where they were seen before, over their ranges.
+
+        ``mounted``: exp(i offset) of the sensor. Turned back by it, all that was seen stays, and
+        where the robot went is turned.
+        """
+        off = self.first - self.turn * self.second - self.to * np.conj(mounted)
+        return np.asarray(np.median(np.abs(off) / np.maximum(np.abs(self.second), 1e-9), axis=-1))
 
 
 def _explained(z1: Array, z2: Array, moved: Array) -> dict[str, float]:
-    """What could be wrong -> `_disagreement` if it were; offsets of bearings by the best alone."""
+    """What could be wrong -> `_Pairs.disagreement` if it were; of offsets of bearings the best."""
     seeing, driving = (np.array(of)[:, None] for of in zip(*EXPLANATIONS.values(), strict=True))
-    found = dict(
-        zip(
-            EXPLANATIONS,
-            _disagreement(z1 * seeing, z2 * seeing, moved * driving).tolist(),
-            strict=True,
-        )
-    )
-    turns = np.column_stack([OFFSETS_RAD, 0.0 * OFFSETS_RAD])[:, None]
-    offsets = _disagreement(
-        z1 + turns, z2 + turns, np.broadcast_to(moved, (len(turns), *moved.shape))
-    )
+    tried = _Pairs.of(z1 * seeing, z2 * seeing, moved * driving).disagreement()
+    found = dict(zip(EXPLANATIONS, tried.tolist(), strict=True))
+    offsets = _Pairs.of(z1, z2, moved).disagreement(np.exp(1j * OFFSETS_RAD)[:, None])
     nearest = int(np.argmin(offsets))
     return {**found, _offset_text(float(OFFSETS_RAD[nearest])): float(offsets[nearest])}
 
@@ -161,7 +171,7 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
     for part in np.unique(parts).tolist():
         own = parts == part
         z1, z2, motion = seen.z[a[own]], seen.z[b[own]], moved[own]
-        plain = float(_disagreement(z1, z2, motion))
+        plain = float(_Pairs.of(z1, z2, motion).disagreement())
         if plain < TOLERANCE:
             continue
         some = slice(None, None, 1 + len(z1) // MOST)

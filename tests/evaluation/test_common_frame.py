@@ -10,7 +10,7 @@ from graphslam.core.config import KnownMapConfig, StartConfig
 from graphslam.core.geometry import compose, transform
 from graphslam.core.records import Trajectory, TrueLandmark
 from graphslam.evaluation.common_frame import places
-from graphslam.evaluation.error_statistics import effective_number, nees_statistics
+from graphslam.evaluation.error_statistics import effective_number, nees_series, nees_statistics
 from graphslam.evaluation.metrics import evaluate
 from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
 
@@ -174,7 +174,7 @@ def test_words_come_for_wrong_covariances_and_seldom_for_right_ones():
         z = correlated(1000, 0.95, rng)
         for scale, found in verdicts.items():
             cov = np.tile(scale * np.eye(3), (len(z), 1, 1))
-            found.append(nees_statistics([z], [cov])["nees_verdict"])
+            found.append(nees_statistics([nees_series(z, cov)])["nees_verdict"])
     assert np.mean([v == "consistent" for v in verdicts[1.0]]) >= 0.9
     assert np.mean([v == "too confident" for v in verdicts[0.25]]) > 0.99
     assert np.mean([v == "too cautious" for v in verdicts[4.0]]) > 0.99
@@ -187,8 +187,8 @@ def test_the_words_say_which_way_and_by_how_much():
         (0.25, "too confident", "2 times as large"),
         (4.0, "too cautious", "2 times as small"),
     ):
-        found = nees_statistics([z], [np.tile(scale * np.eye(3), (400, 1, 1))])
+        found = nees_statistics([nees_series(z, np.tile(scale * np.eye(3), (400, 1, 1)))])
         (text,) = evaluation_notes({"robots": {"r": {"final": found}}})
         assert text.startswith(f"r, final poses: covariances are {way}") and size in text
-    honest = nees_statistics([z], [np.tile(np.eye(3), (400, 1, 1))])
+    honest = nees_statistics([nees_series(z, np.tile(np.eye(3), (400, 1, 1)))])
     assert evaluation_notes({"robots": {"r": {"final": honest}}}) == []

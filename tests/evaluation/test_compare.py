@@ -25,7 +25,7 @@ from graphslam.evaluation.ground_truth import truth_of_logs
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.recorded_steps import record_steps
 from graphslam.evaluation.timed_replay import growth_exponent, timed_replay, timed_replay_in_process
-from graphslam.evaluation.trajectory_metrics import pair_poses, trajectory_metrics
+from graphslam.evaluation.trajectory_metrics import pair_poses, path_errors, trajectory_metrics
 from graphslam.logs import GroundTruth, LogWriter, open_logs
 from graphslam.results.report_comparison import (
     comparison_tables,
@@ -608,7 +608,9 @@ def test_dead_reckoning_is_of_odometry_as_recorded(tmp_path):
         run=timed_replay,
     )  # fmt: skip
     (own,) = smooth(log, config).robots.values()
-    recorded = trajectory_metrics([pair_poses(own.dead_reckoning, truth.trajectories["robot"])])
+    recorded = trajectory_metrics(
+        [path_errors(pair_poses(own.dead_reckoning, truth.trajectories["robot"]))]
+    )
     found = rows_of(done)["dead-reckoning"]["joint"]["final"]
     assert found["ate_aligned_rmse_m"] == pytest.approx(recorded["ate_aligned_rmse_m"], rel=0.02)
     assert found["rpe"]["10_m"]["rot_rmse_rad"] == pytest.approx(0.2, rel=0.3)

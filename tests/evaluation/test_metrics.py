@@ -12,7 +12,7 @@ from synthetic_results import START_NS, orchard, room, room_walls
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import between, compose, exp, transform, wrap
 from graphslam.core.records import Landmark, Trajectory, TrueLandmark
-from graphslam.evaluation.error_statistics import nees, nees_statistics
+from graphslam.evaluation.error_statistics import nees, nees_series, nees_statistics
 from graphslam.evaluation.landmark_metrics import landmark_metrics
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import (
@@ -24,6 +24,7 @@ from graphslam.evaluation.relation_metrics import (
 from graphslam.evaluation.trajectory_metrics import (
     align,
     pair_poses,
+    path_errors,
     relative_errors,
     trajectory_metrics,
 )
@@ -109,7 +110,7 @@ def test_a_robot_that_stands_is_aligned_by_its_heading(noise_m):
     truth = trajectory(stamps, np.tile([21.5, 17.9, np.pi], (60, 1)))
     noise = np.column_stack([rng.normal(0, noise_m, (60, 2)), rng.normal(0, 0.001, 60)])
     own = trajectory(stamps, noise)  # its frame begins where it stands
-    found = trajectory_metrics([pair_poses(own, truth)])
+    found = trajectory_metrics([path_errors(pair_poses(own, truth))])
     assert found["heading_aligned_rmse_rad"] < 0.002
     assert found["ate_aligned_rmse_m"] <= 2 * noise_m + 1e-9
 
@@ -120,7 +121,7 @@ def test_a_short_way_that_is_known_well_is_aligned_by_its_positions():
     truth = trajectory(truth.stamps_ns, truth.poses * [0.005, 0.005, 1.0])
     pose = np.array([3.0, 4.0, 2.0])
     off = trajectory(truth.stamps_ns, compose(pose, truth.poses) + np.array([0, 0, 0.1]))
-    found = trajectory_metrics([pair_poses(off, truth)])
+    found = trajectory_metrics([path_errors(pair_poses(off, truth))])
     assert found["heading_aligned_rmse_rad"] == pytest.approx(0.1, abs=1e-9)
     assert found["ate_aligned_rmse_m"] == pytest.approx(0.0, abs=1e-9)
 
@@ -129,7 +130,7 @@ def test_a_shifted_trajectory_has_that_error_and_none_aligned():
     truth = circle(50)
     pose = np.array([3.0, 4.0, 0.0])
     moved = trajectory(truth.stamps_ns, truth.poses + pose)
-    found = trajectory_metrics([pair_poses(moved, truth)])
+    found = trajectory_metrics([path_errors(pair_poses(moved, truth))])
     assert found["ate_rmse_m"] == pytest.approx(5.0, abs=1e-12)
     assert found["max_m"] == pytest.approx(5.0, abs=1e-12)
     assert found["ate_aligned_rmse_m"] == pytest.approx(0.0, abs=1e-12)
@@ -140,7 +141,7 @@ def test_a_shifted_trajectory_has_that_error_and_none_aligned():
 def test_heading_errors_are_taken_around_the_circle():
     truth = trajectory([0, 1, 2], [[0, 0, np.pi - 0.01]] * 3)
     turned = trajectory([0, 1, 2], [[0, 0, -np.pi + 0.01]] * 3)
-    found = trajectory_metrics([pair_poses(turned, truth)])
+    found = trajectory_metrics([path_errors(pair_poses(turned, truth))])
     assert found["heading_rmse_rad"] == pytest.approx(0.02, abs=1e-12)
 
 
@@ -164,7 +165,7 @@ def test_relative_errors_need_partners():
     pairs = pair_poses(circle(5, step_ns=10 * S), circle(5, step_ns=10 * S))
     assert relative_errors(pairs, seconds=1.0).shape == (0, 3)
     assert relative_errors(pairs, metres=10.0).shape == (0, 3)
-    found = trajectory_metrics([pairs])
+    found = trajectory_metrics([path_errors(pairs)])
     assert found["rpe"]["10_m"] == {"pairs": 0, "trans_rmse_m": None, "rot_rmse_rad": None}
     with pytest.raises(ValueError, match="seconds or metres"):
         relative_errors(pairs)
@@ -179,7 +180,7 @@ def test_honest_covariances_have_nees_one_and_cover_95_percent():
     A = rng.normal(size=(n, 3, 3))
     covs = A @ A.mT + 0.1 * np.eye(3)
     errors = np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.normal(size=(n, 3)))
-    found = nees_statistics([errors], [covs])
+    found = nees_statistics([nees_series(errors, covs)])
     low, high = found["nees_bounds"]
     assert low < 1 < high
     # independent errors, so the average leaves 99.99 % bounds for one seed in 10 000
@@ -190,8 +191,8 @@ def test_honest_covariances_have_nees_one_and_cover_95_percent():
 
 def test_stated_sigmas_half_as_large_show_as_four_times_the_nees():
     errors, covs = np.ones((5, 3)), np.tile(np.eye(3), (5, 1, 1))
-    assert nees_statistics([errors], [covs])["nees_per_dof"] == pytest.approx(1.0)
-    assert nees_statistics([errors], [covs / 4])["nees_per_dof"] == pytest.approx(4.0)
+    assert nees_statistics([nees_series(errors, covs)])["nees_per_dof"] == pytest.approx(1.0)
+    assert nees_statistics([nees_series(errors, covs / 4)])["nees_per_dof"] == pytest.approx(4.0)
 
 
 def test_unusable_covariances_are_left_out():
@@ -199,7 +200,7 @@ def test_unusable_covariances_are_left_out():
     values = nees(np.ones((4, 3)), covs)
     assert values[0] == pytest.approx(3.0)
     assert np.isnan(values[1:]).all()
-    nothing = nees_statistics([np.ones((2, 3))], [np.full((2, 3, 3), np.nan)])
+    nothing = nees_statistics([nees_series(np.ones((2, 3)), np.full((2, 3, 3), np.nan))])
     assert set(nothing.values()) == {None}
     assert {"nees_per_dof", "nees_bounds", "nees_verdict", "coverage"} <= set(nothing)
 
@@ -543,11 +544,13 @@ def test_one_alignment_of_all_robots_leaves_what_is_between_them(tmp_path):
     pose = np.array([5.0, 1.0, 0.4])
     moved = trajectory(truth.stamps_ns, compose(pose, truth.poses))
     both = [pair_poses(moved, truth), pair_poses(moved, truth)]
-    assert trajectory_metrics(both)["ate_aligned_rmse_m"] < 1e-12
+    assert trajectory_metrics(list(map(path_errors, both)))["ate_aligned_rmse_m"] < 1e-12
     both[1] = pair_poses(
         trajectory(truth.stamps_ns, compose(pose, truth.poses) + np.array([0, 1, 0])), truth
     )
-    assert trajectory_metrics(both)["ate_aligned_rmse_m"] > 0.4  # half of the metre each
+    assert (
+        trajectory_metrics(list(map(path_errors, both)))["ate_aligned_rmse_m"] > 0.4
+    )  # half of the metre each
 
 
 def test_room_lines_are_consistent_and_relations_are_answered(tmp_path):
