@@ -9,18 +9,20 @@ climbs its tree for each variable that it is asked for.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.geometry import Array
 
-#: numbers in covariances of cliques that are kept until joint ones are read from them
+#: numbers in covariances of cliques that are kept until those of variables are read from them
 NOTED = 1_000_000
+#: the clique above one without separator
+NONE = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,25 +78,23 @@ def covariance_blocks(
     for pair in others:
         graph.add(_empty_factor(*pair[:2]))
     wanted.update(others)
-    cliques, clique_of = _eliminated(graph, use_qr)
-    pairs_in: dict[int, list[tuple[int, ...]]] = defaultdict(list)
-    for pair in wanted:
-        # of the variables in one factor the first eliminated has the others in its row
-        pairs_in[max(map(clique_of.__getitem__, pair))].append(pair)
-    marginals: dict[int, Array] = {}
-    joint = _Blocks()
-    for number, clique in enumerate(cliques):
-        above = None if clique.above is None else cliques[clique.above]
-        cov = clique.invert(above)
-        for key in clique.own:
-            rows = slice(clique.starts[key], clique.starts[key] + clique.sizes[key])
-            marginals[key] = cov[rows, rows]
-        if number in pairs_in:
-            joint.note(cov, clique, pairs_in[number])
-        if above is not None:
-            above.release()
-    rows_of = tuple(clique.rows() for clique in cliques) if keep_rows else None
-    return CovarianceBlocks(marginals, joint.read(), rows_of)
+    tree = _Tree.of(graph, use_qr)
+    blocks = _Blocks(tree, wanted)
+    held, first = tree.rows_above()
+    kept: dict[int, Array] = {}  # covariances that cliques below need
+    below = tree.below.tolist()
+    for number, above in enumerate(tree.above.tolist()):
+        rows = held[first[number] : first[number + 1]]
+        cov = _inverted(tree.conditionals[number], kept.get(above), rows)
+        if below[number]:
+            kept[number] = cov
+        if above != NONE:
+            below[above] -= 1
+            if not below[above]:
+                del kept[above]
+        blocks.add(cov)
+    blocks.read()
+    return CovarianceBlocks(blocks.marginals, blocks.joint, tree.rows() if keep_rows else None)
 
 
 def root_rows(graph: gtsam.GaussianFactorGraph, *, use_qr: bool = False) -> tuple[CliqueRows, ...]:
@@ -103,47 +103,33 @@ def root_rows(graph: gtsam.GaussianFactorGraph, *, use_qr: bool = False) -> tupl
     Raises:
         RuntimeError: the graph is indeterminate (by QR: the root is not finite instead).
     """
-    cliques, _ = _eliminated(graph, use_qr)
-    return tuple(clique.rows() for clique in cliques)
+    return _Tree.of(graph, use_qr).rows()
 
 
-class _Blocks:
-    """Joint covariances of a few variables each, read from those of cliques many at once."""
+def _inverted(conditional: gtsam.GaussianConditional, above: Array | None, rows: IntArray) -> Array:
+    """Covariance of a clique's own variables and then its separator.
 
-    def __init__(self) -> None:
-        self._found: dict[tuple[int, ...], Array] = {}
-        self._forget()
-
-    def _forget(self) -> None:
-        # by dimensions: keys, where the covariance begins, its width, where their rows begin
-        self._noted: dict[tuple[int, ...], list[tuple[Any, ...]]] = defaultdict(list)
-        self._covs: list[Array] = []
-        self._size = 0
-
-    def note(self, cov: Array, clique: "_Clique", wanted: Iterable[tuple[int, ...]]) -> None:
-        """Note which keys are wanted of the covariance (n, n) of a clique."""
-        start, size = clique.starts.__getitem__, clique.sizes.__getitem__
-        width, first = len(cov), self._size
-        for keys in wanted:
-            self._noted[tuple(map(size, keys))].append(
-                (keys, first, width, tuple(map(start, keys)))
-            )
-        self._covs.append(cov.ravel())
-        self._size += cov.size
-        if self._size > NOTED:
-            self.read()
-
-    def read(self) -> dict[tuple[int, ...], Array]:
-        """Keys -> covariance (k, k), of all that was noted."""
-        flat = np.concatenate([*self._covs, np.zeros(0)])
-        for dims, noted in self._noted.items():
-            keys, first, width, starts = zip(*noted, strict=True)
-            rows = np.repeat(starts, dims, axis=1)
-            rows += np.concatenate([np.arange(dim) for dim in dims])
-            begin = np.array(first)[:, None] + rows * np.array(width)[:, None]
-            self._found.update(zip(keys, flat[begin[:, :, None] + rows[:, None]], strict=True))
-        self._forget()
-        return self._found
+    Args:
+        conditional: its rows of the root.
+        above: covariance of the clique above it; None without separator.
+        rows: (m,) of the separator in ``above``.
+    """
+    inverse, singular = dtrtri(conditional.R())
+    inverse, own = np.asarray(inverse), len(inverse)
+    if singular:
+        inverse = np.full((own, own), np.nan)
+    if above is None:
+        return np.asarray(inverse @ inverse.T)
+    joint = above.take(rows, axis=0).take(rows, axis=1)
+    gain = inverse @ conditional.S()
+    cross = gain @ joint
+    end = own + len(joint)
+    cov = np.empty((end, end))
+    cov[:own, :own] = inverse @ inverse.T + cross @ gain.T
+    np.negative(cross, out=cov[:own, own:])
+    np.negative(cross.T, out=cov[own:, :own])
+    cov[own:, own:] = joint
+    return cov
 
 
 def _empty_factor(a: int, b: int) -> gtsam.JacobianFactor:
@@ -152,89 +138,181 @@ def _empty_factor(a: int, b: int) -> gtsam.JacobianFactor:
     return gtsam.JacobianFactor(a, nothing, b, nothing, np.zeros(1), unit)
 
 
-@dataclass(slots=True, eq=False)
-class _Clique:
-    """Variables whose rows of the square root end in the same later variables, the separator.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tree:
+    """The c cliques of an eliminated graph, each after the one above it, and its v variables.
 
-    ``conditional``: these rows. ``above``: number of the clique that has the whole separator; None
-    without separator. ``sizes``: key -> dimension, of all variables. ``starts``: key -> its first
-    row in the covariance. ``below``: how many cliques still need the covariance.
+    A clique has own variables, whose rows of the square root end in the same later variables, the
+    separator, all of which are in the clique ``above``.
+
+    ``conditionals``: these rows. ``above`` (c,): its number, `NONE` without separator; ``below``
+    (c,): how many are below. ``keys`` (v,) are sorted, ``sizes`` (v,) their dimensions,
+    ``clique_of`` (v,) the cliques that own them. The e members of all cliques one after another:
+    ``member`` (e,) is a number of a variable, ``start`` (e,) its first row in the covariance of
+    the ``clique`` (e,), ``is_own`` (e,) whether that owns it. ``width`` (c,): of that covariance.
+    ``place`` (e,): clique times v + variable, sorted; ``by_place`` (e,): whose they are.
     """
 
-    conditional: gtsam.GaussianConditional
-    own: list[int]
-    separator: list[int]
-    above: int | None
-    below: int
-    sizes: Mapping[int, int]
-    starts: Mapping[int, int]
-    _cov: Array | None = None
+    conditionals: list[gtsam.GaussianConditional]
+    above: IntArray
+    below: IntArray
+    keys: IntArray
+    sizes: IntArray
+    clique_of: IntArray
+    member: IntArray
+    start: IntArray
+    clique: IntArray
+    is_own: BoolArray
+    width: IntArray
+    place: IntArray
+    by_place: IntArray
 
-    def rows(self) -> CliqueRows:
-        """What others see of it."""
-        own = {key: self.sizes[key] for key in self.own}
-        block = np.hstack((self.conditional.R(), self.conditional.S()))
-        return CliqueRows(own, self.separator, self.above, block)
+    @classmethod
+    def of(cls, graph: gtsam.GaussianFactorGraph, use_qr: bool) -> "_Tree":
+        """Eliminate a graph."""
+        ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
+        tree = graph.eliminateMultifrontal(ordering, *((gtsam.EliminateQR,) if use_qr else ()))
+        conditionals: list[gtsam.GaussianConditional] = []
+        numbers_above: list[int] = []
+        below: list[int] = []
+        owned: list[int] = []
+        counts: list[int] = []
+        members: list[int] = []
+        waiting: list[tuple[gtsam.GaussianBayesTreeClique, int]] = []
+        waiting += [(root, NONE) for root in tree.roots()]
+        while waiting:
+            node, above = waiting.pop()
+            number, children, conditional = len(below), node.nrChildren(), node.conditional()
+            own = conditional.keys()
+            members += own
+            conditionals.append(conditional)
+            counts.append(len(own))
+            owned.append(conditional.rows())
+            numbers_above.append(above)
+            below.append(children)
+            waiting += [(node[k], number) for k in range(children)]
+        keys, member = np.unique(np.array(members, dtype=np.int64), return_inverse=True)
+        gradient = graph.gradientAtZero()
+        sizes = np.array([len(gradient.at(key)) for key in keys.tolist()], dtype=np.int64)
+        clique = np.repeat(np.arange(len(counts)), counts)
+        ends = np.cumsum(sizes[member])
+        lasts = np.append(0, ends)[np.append(0, np.cumsum(counts))]
+        start = ends - sizes[member] - lasts[clique]
+        is_own = start < np.array(owned, dtype=np.int64)[clique]
+        clique_of = np.empty(len(keys), dtype=np.int64)
+        clique_of[member[is_own]] = clique[is_own]
+        place = clique * len(keys) + member
+        by_place = np.argsort(place)
+        above_of, below_of = (np.array(x, dtype=np.int64) for x in (numbers_above, below))
+        return cls(
+            conditionals, above_of, below_of, keys, sizes, clique_of,
+            member, start, clique, is_own, np.diff(lasts), place[by_place], by_place,
+        )  # fmt: skip
 
-    def invert(self, above: "_Clique | None") -> Array:
-        """Covariance of the own variables and then the separator; kept while it is needed."""
-        inverse, singular = dtrtri(self.conditional.R())
-        inverse, own = np.asarray(inverse), len(inverse)
-        if singular:
-            inverse = np.full((own, own), np.nan)
-        if above is None:
-            cov = np.asarray(inverse @ inverse.T)
-        else:
-            assert above._cov is not None
-            starts, sizes = above.starts, self.sizes
-            held: list[int] = []
-            for key in self.separator:
-                held += range(starts[key], starts[key] + sizes[key])
-            which = np.array(held)
-            joint = above._cov.take(which, axis=0).take(which, axis=1)
-            gain = inverse @ self.conditional.S()
-            cross = gain @ joint
-            end = own + len(joint)
-            cov = np.empty((end, end))
-            cov[:own, :own] = inverse @ inverse.T + cross @ gain.T
-            np.negative(cross, out=cov[:own, own:])
-            np.negative(cross.T, out=cov[own:, :own])
-            cov[own:, own:] = joint
-        if self.below:
-            self._cov = cov
-        return cov
+    def starts(self, cliques: IntArray, variables: IntArray) -> IntArray:
+        """First rows (n,) of variables in the covariances of cliques that have them."""
+        wanted = cliques * len(self.keys) + variables
+        return self.start[self.by_place[np.searchsorted(self.place, wanted)]]
 
-    def release(self) -> None:
-        """One clique less needs the covariance."""
-        self.below -= 1
-        if not self.below:
-            self._cov = None
+    def rows_above(self) -> tuple[IntArray, IntArray]:
+        """Rows (r,) of all separators in the covariances above them, and where each's begin.
+
+        The latter (c + 1,) with the end of the last.
+        """
+        separators = np.flatnonzero(~self.is_own)
+        below, member = self.clique[separators], self.member[separators]
+        sizes = self.sizes[member]
+        rows = _ranges(self.starts(self.above[below], member), sizes)
+        counts = np.bincount(below, sizes, len(self.above)).astype(np.int64)
+        return rows, np.append(0, np.cumsum(counts))
+
+    def rows(self) -> tuple[CliqueRows, ...]:
+        """What others see of the root."""
+        found = []
+        keys, sizes = self.keys[self.member], self.sizes[self.member]
+        ends = np.append(0, np.cumsum(np.bincount(self.clique, minlength=len(self.above))))
+        owned = np.bincount(self.clique, self.is_own, len(self.above)).astype(np.int64)
+        for number, conditional in enumerate(self.conditionals):
+            begin, end = ends[number : number + 2]
+            middle, above = begin + owned[number], int(self.above[number])
+            own = dict(zip(keys[begin:middle].tolist(), sizes[begin:middle].tolist(), strict=True))
+            block = np.hstack((conditional.R(), conditional.S()))
+            separator = keys[middle:end].tolist()
+            found.append(CliqueRows(own, separator, None if above == NONE else above, block))
+        return tuple(found)
 
 
-def _eliminated(
-    graph: gtsam.GaussianFactorGraph, use_qr: bool
-) -> tuple[list[_Clique], dict[int, int]]:
-    """Cliques of a graph, each after the one above it, and the clique of each variable."""
-    ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
-    by_qr = (gtsam.EliminateQR,) if use_qr else ()
-    tree = graph.eliminateMultifrontal(ordering, *by_qr)
-    gradient = graph.gradientAtZero()
-    sizes = {key: len(gradient.at(key)) for key in map(ordering.at, range(ordering.size()))}
-    cliques: list[_Clique] = []
-    clique_of: dict[int, int] = {}
-    waiting: list[tuple[gtsam.GaussianBayesTreeClique, int | None]] = []
-    waiting += [(root, None) for root in tree.roots()]
-    while waiting:
-        node, above = waiting.pop()
-        number, below, conditional = len(cliques), node.nrChildren(), node.conditional()
-        keys, dim = conditional.keys(), len(conditional.R())
-        starts, count, end = {}, 0, 0
-        for key in keys:
-            count += end < dim
-            starts[key] = end
-            end += sizes[key]
-        own = keys[:count]
-        clique_of.update(dict.fromkeys(own, number))
-        cliques.append(_Clique(conditional, own, keys[count:], above, below, sizes, starts))
-        waiting += [(node[k], number) for k in range(below)]
-    return cliques, clique_of
+def _ranges(first: IntArray, sizes: IntArray) -> IntArray:
+    """The numbers from each ``first`` (n,) on, ``sizes`` (n,) of them, one after another."""
+    offsets = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return np.repeat(first, sizes) + offsets
+
+
+class _Blocks:
+    """Covariances of single variables and of a few together, read from those of many cliques."""
+
+    def __init__(self, tree: _Tree, wanted: Collection[tuple[int, ...]]) -> None:
+        """``wanted``: keys of variables that are in one clique."""
+        self.marginals: dict[int, Array] = {}
+        self.joint: dict[tuple[int, ...], Array] = {}
+        self._tree = tree
+        self._covs: list[Array] = []
+        self._size, self._first = 0, 0  # numbers in them; the first of their cliques
+        # each by what it is called, its clique, and where its rows begin there: in their order
+        own = np.flatnonzero(tree.is_own)
+        self._singles = own, tree.sizes[tree.member[own]]
+        by_count: dict[int, list[tuple[int, ...]]] = defaultdict(list)
+        for names in wanted:
+            by_count[len(names)].append(names)
+        self._several = [self._sorted(some) for some in by_count.values()]
+
+    def _sorted(
+        self, wanted: list[tuple[int, ...]]
+    ) -> tuple[list[tuple[int, ...]], IntArray, IntArray, IntArray]:
+        """Keys (n, k) in the order of their cliques, these (n,), their starts and sizes (n, k)."""
+        tree = self._tree
+        variables = np.searchsorted(tree.keys, np.array(wanted, dtype=np.int64))
+        # of the variables in one factor the first eliminated has the others in its row
+        cliques = tree.clique_of[variables].max(axis=1)
+        order = np.argsort(cliques, kind="stable")
+        cliques, variables = cliques[order], variables[order]
+        starts = tree.starts(np.repeat(cliques, variables.shape[1]), variables.ravel())
+        names = [wanted[k] for k in order.tolist()]
+        return names, cliques, starts.reshape(variables.shape), tree.sizes[variables]
+
+    def add(self, cov: Array) -> None:
+        """Take the covariance (n, n) of the next clique."""
+        self._covs.append(cov.ravel())
+        self._size += cov.size
+        if self._size > NOTED:
+            self.read()
+
+    def read(self) -> None:
+        """Read what there is in the covariances that were taken."""
+        tree, first, last = self._tree, self._first, self._first + len(self._covs)
+        flat = np.concatenate([*self._covs, np.zeros(0)])
+        widths = tree.width[first:last]
+        begins = np.cumsum(widths**2) - widths**2
+
+        def gather(cliques: IntArray, starts: IntArray, dims: tuple[int, ...]) -> Array:
+            rows = np.repeat(starts, dims, axis=1) + _ranges(
+                np.zeros(len(dims), dtype=np.int64), np.array(dims)
+            )
+            begin = begins[cliques - first][:, None] + rows * widths[cliques - first][:, None]
+            return np.asarray(flat[begin[:, :, None] + rows[:, None]])
+
+        own, sizes = self._singles
+        part = slice(*np.searchsorted(tree.clique[own], [first, last]).tolist())
+        own, sizes = own[part], sizes[part]
+        for dim in np.unique(sizes).tolist():
+            some = own[sizes == dim]
+            covs = gather(tree.clique[some], tree.start[some][:, None], (dim,))
+            self.marginals.update(zip(tree.keys[tree.member[some]].tolist(), covs, strict=True))
+        for names, cliques, starts, several in self._several:
+            begin, end = np.searchsorted(cliques, [first, last]).tolist()
+            shapes, of = np.unique(several[begin:end], axis=0, return_inverse=True)
+            for number, dims in enumerate(shapes.tolist()):
+                which = begin + np.flatnonzero(of.ravel() == number)
+                covs = gather(cliques[which], starts[which], tuple(dims))
+                self.joint.update(zip((names[k] for k in which.tolist()), covs, strict=True))
+        self._covs, self._size, self._first = [], 0, last
