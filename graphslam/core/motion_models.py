@@ -7,8 +7,9 @@ longer than an interval between two states, so within an interval its *effect* a
 treats it as white (see docs/thesis.md for why that misstates it).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -53,16 +54,31 @@ def wheel_jacobian(angles_rad: Array, robot: RobotConfig) -> Array:
     return J
 
 
-def model_error_cov(twists: Array, seconds: Array, config: OdometryConfig) -> Array:
+def model_error_cov(
+    twists: Array, seconds: Array, config: OdometryConfig, rates: Array | None = None
+) -> Array:
     """Covariance ``(n, 3, 3)`` of the white model error of motions ``(n, 3)``, eq. 4.14.
 
     Along the axes of each increment's start frame; linear in path, turning and the ``seconds``
-    (n,) in motion, so it does not depend on how finely the odometry is sampled.
+    (n,) in motion, so it does not depend on how finely the odometry is sampled. ``rates`` (n, 9),
+    in the order of `RATES`, are those of each motion; without, all have those of ``config``.
     """
-    rates = np.array([getattr(config, name) for name in RATES]).reshape(3, 3)
+    used = rates_of_config(config) if rates is None else rates
     cov = np.zeros((len(twists), 3, 3))
-    cov[:, range(3), range(3)] = _amounts(twists, seconds) @ rates.T
+    by_axis = used.reshape(-1, 3, 3) @ _amounts(twists, seconds)[:, :, None]
+    cov[:, range(3), range(3)] = by_axis[:, :, 0]
     return cov
+
+
+def rates_of_config(config: OdometryConfig) -> Array:
+    """The rates (9,) of the model error by settings, in the order of `RATES`."""
+    return np.array([getattr(config, name) for name in RATES])
+
+
+def with_rates(config: OdometryConfig, rates: Array) -> OdometryConfig:
+    """Settings with other rates (9,) of the noise, in the order of `RATES`."""
+    values: dict[str, Any] = dict(zip(RATES, rates.tolist(), strict=True))
+    return replace(config, **values)
 
 
 def unit_error_covs(source: str, rows: Array, calibration: Array, robot: RobotConfig) -> Array:
@@ -138,7 +154,11 @@ class Calibration:
 
 
 def odometry_increments(
-    rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig
+    rows: Array,
+    calibration: Array,
+    _robot: RobotConfig,
+    config: OdometryConfig,
+    rates: Array | None = None,
 ) -> Increments:
     """Increments of an odometry that reports poses: ``rows`` (n, 4) are twists and seconds.
 
@@ -151,12 +171,16 @@ def odometry_increments(
     d_twist[:, 2, 1] = rows[:, 2]
     d_twist[:, 2, 2] = rows[:, 0]
     twists = rows + (d_twist @ calibration[..., None])[..., 0]
-    cov = model_error_cov(rows, seconds, config)
+    cov = model_error_cov(rows, seconds, config, rates)
     return Increments(exp(twists), cov, exp_jacobian(twists) @ d_twist)
 
 
 def command_increments(
-    rows: Array, calibration: Array, _robot: RobotConfig, config: OdometryConfig
+    rows: Array,
+    calibration: Array,
+    _robot: RobotConfig,
+    config: OdometryConfig,
+    rates: Array | None = None,
 ) -> Increments:
     """Increments of commanded velocities, as poses: ``rows`` (n, 4) are twists and seconds.
 
@@ -174,7 +198,7 @@ def command_increments(
     d_twist[:, 2, 2] = rows[:, 0]
     d_twist[:, :2, 3] = -rows[:, :2] * (curvature**2)[:, None]
     twists = rows + (d_twist @ calibration[..., None])[..., 0]
-    cov = model_error_cov(rows, seconds, config)
+    cov = model_error_cov(rows, seconds, config, rates)
     return Increments(exp(twists), cov, exp_jacobian(twists) @ d_twist)
 
 
@@ -196,7 +220,11 @@ def parameter_cov(source: str, rows: Array, robot: RobotConfig, config: Odometry
 
 
 def given_increments(
-    rows: Array, _calibration: Array, _robot: RobotConfig, _config: OdometryConfig
+    rows: Array,
+    _calibration: Array,
+    _robot: RobotConfig,
+    _config: OdometryConfig,
+    _rates: Array | None = None,
 ) -> Increments:
     """Increments that bring their own covariance: ``rows`` (n, 12) are twist and covariance.
 
@@ -207,7 +235,11 @@ def given_increments(
 
 
 def wheel_increments(
-    rows: Array, calibration: Array, robot: RobotConfig, config: OdometryConfig
+    rows: Array,
+    calibration: Array,
+    robot: RobotConfig,
+    config: OdometryConfig,
+    rates: Array | None = None,
 ) -> Increments:
     """Increments of wheel rotations: ``rows`` (n, 3) left and right, rad, and seconds.
 
@@ -221,7 +253,9 @@ def wheel_increments(
     J = exp_jacobian(twists) @ wheel_jacobian(rows, robot)
     moved = np.any(rows != 0, axis=1)
     counting = (config.count_sigma_rad**2 * moved)[:, None, None]
-    cov = model_error_cov(twists, seconds, config) + counting * (J[:, :, 2:4] @ J[:, :, 2:4].mT)
+    cov = model_error_cov(twists, seconds, config, rates) + counting * (
+        J[:, :, 2:4] @ J[:, :, 2:4].mT
+    )
     return Increments(exp(twists), cov, J[:, :, [0, 1, 4]])
 
 
@@ -326,8 +360,21 @@ def _prior(names: tuple[str, ...], sigmas: Sequence[float]) -> Calibration:
     return Calibration(names, np.zeros(len(values)), np.diag(values**2))
 
 
+class MotionSource(Protocol):
+    """Increments (n) of a source's rows (n, k), see the functions above.
+
+    Calibrations are (p,) or (n, p), ``rates`` (n, 9) those of `model_error_cov`.
+    """
+
+    def __call__(
+        self, rows: Array, calibration: Array, robot: RobotConfig, config: OdometryConfig,
+        rates: Array | None = None, /,
+    ) -> Increments:  # fmt: skip
+        """Make them."""
+
+
 #: motion source -> increments of its rows; rows scale with the share of an interval that is used
-MOTION_SOURCES: dict[str, Callable[[Array, Array, RobotConfig, OdometryConfig], Increments]] = {
+MOTION_SOURCES: dict[str, MotionSource] = {
     "given": given_increments,
     "odometry": odometry_increments,
     "commands": command_increments,

@@ -21,11 +21,14 @@ from graphslam.estimation.log_noise import MOTION, LogNoise
 from graphslam.estimation.posterior_residuals import Posterior, spans
 from graphslam.odometry.increment_sums import IncrementSums
 from graphslam.odometry.noise_estimation import (
+    Asked,
     fit_noise,
     is_stated,
     motion_variances,
     variance_sigma,
+    variances_by_rate,
     with_fit_uncertainty,
+    without_noise,
 )
 from graphslam.odometry.preintegration import Track
 
@@ -121,38 +124,47 @@ class NoiseFit(NamedTuple):
     log_sigma: Array
 
 
-def fit_track_noise(
-    track: Track, robot: str, posterior: Posterior, *, relax: bool
-) -> NoiseFit | None:
-    """Give a track whose noise nobody states that of its motions in a solution.
+def fit_odometry_noise(
+    tracks: Mapping[str, Track], posterior: Posterior, *, relax: bool
+) -> dict[str, NoiseFit]:
+    """Give tracks whose noise nobody states that of their motions in a solution.
 
-    Motions that scans replaced, or of which readings miss a part, are left out.
+    Motions that scans replaced, or of which readings miss a part, are left out. A robot of which
+    there are too few motions keeps its noise, and has no fit.
 
     Args:
-        track: odometry of ``robot``, with the calibration that was found.
-        robot: its name.
-        posterior: a solution; too few motions in it change nothing.
+        tracks: robot -> its odometry, with the calibration that was found.
+        posterior: a solution.
         relax: see `fit_noise`.
-
-    Returns:
-        None if there are too few motions.
     """
-    own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
-    times = _times(own)
-    by_odometry = np.array([not motion.from_scans for motion in own], dtype=bool)
-    by_odometry &= ~track.is_uncovered(*times)
-    if by_odometry.sum() < FEW_MOTIONS:
-        return None
-    found = posterior.motions(robot, posterior.made[robot])
-    used = times[0][by_odometry], times[1][by_odometry]
-    variances, normalised, left = (
-        of[by_odometry] for of in (found.variance, found.normalised, found.redundancy)
-    )
-    track.config, after = fit_noise(track, used, variances, normalised, left, relax=relax)
-    change = np.abs(np.mean(after / variances, axis=0) - 1.0)
-    log_sigma = variance_sigma(left)
-    change[change < NEGLIGIBLE * log_sigma] = 0.0
-    return NoiseFit(float(change[[0, 2]].max()), log_sigma)
+    asked, shown = dict[str, Asked](), dict[str, tuple[Array, Array, Array]]()
+    for robot, track in tracks.items():
+        own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
+        times = _times(own)
+        by_odometry = np.array([not motion.from_scans for motion in own], dtype=bool)
+        by_odometry &= ~track.is_uncovered(*times)
+        if by_odometry.sum() < FEW_MOTIONS:
+            continue
+        found = posterior.motions(robot, posterior.made[robot])
+        asked[robot] = track, times[0][by_odometry], times[1][by_odometry]
+        shown[robot] = (
+            found.variance[by_odometry],
+            found.normalised[by_odometry],
+            found.redundancy[by_odometry],
+        )
+    every = list(asked.values())
+    known = motion_variances(every, [without_noise(track.config) for track, _, _ in every])
+    fits = {}
+    for robot, without, gained in zip(asked, known, variances_by_rate(every), strict=True):
+        track, (variances, normalised, left) = tracks[robot], shown[robot]
+        track.config, after = fit_noise(
+            track.config, without, gained, variances, normalised, left, relax=relax
+        )
+        change = np.abs(np.mean(after / variances, axis=0) - 1.0)
+        log_sigma = variance_sigma(left)
+        change[change < NEGLIGIBLE * log_sigma] = 0.0
+        fits[robot] = NoiseFit(float(change[[0, 2]].max()), log_sigma)
+    return fits
 
 
 def middle_of_paths(
@@ -213,7 +225,8 @@ def measured_motion_noise(track: Track, robot: str, posterior: Posterior) -> Arr
     found = posterior.motions(robot, _joined(posterior.made[robot], of), over_spans=True)
     # every motion was solved with a least sigma, as where the robot stands
     least = MIN_SIGMA**2 * np.diff(of, axis=1)
-    stated = np.maximum(motion_variances(track, track.config, over), least)
+    (by_settings,) = motion_variances([(track, *over)], [track.config])
+    stated = np.maximum(by_settings, least)
     return found.variance_factor() * np.median(found.variance / stated, axis=0)
 
 
@@ -223,7 +236,7 @@ def stated_robots(tracks: Mapping[str, Track]) -> set[str]:
 
 
 def fit_motion_noise(tracks: Mapping[str, Track], solutions: Iterable[Posterior]) -> LogNoise:
-    """`fit_track_noise` of all tracks; of those whose noise is stated what is measured.
+    """`fit_odometry_noise` of all tracks; of those whose noise is stated what is measured.
 
     Args:
         tracks: odometry of the robots.
@@ -235,13 +248,11 @@ def fit_motion_noise(tracks: Mapping[str, Track], solutions: Iterable[Posterior]
     measured: dict[tuple[str, str], Array] = {}
     fits: dict[str, NoiseFit] = {}
     for posterior in solutions:
-        for robot, track in tracks.items():
-            if robot in stated:
-                found = measured_motion_noise(track, robot, posterior)
-                measured |= {} if found is None else {(robot, MOTION): found}
-            else:
-                fit = fit_track_noise(track, robot, posterior, relax=False)
-                fits |= {} if fit is None else {robot: fit}
+        for robot in stated:
+            found = measured_motion_noise(tracks[robot], robot, posterior)
+            measured |= {} if found is None else {(robot, MOTION): found}
+        open_ones = {robot: track for robot, track in tracks.items() if robot not in stated}
+        fits |= fit_odometry_noise(open_ones, posterior, relax=False)
     for robot, fit in fits.items():
         tracks[robot].config = with_fit_uncertainty(tracks[robot].config, fit.log_sigma)
     used = {name: track.config for name, track in tracks.items() if (name, MOTION) not in measured}

@@ -8,20 +8,24 @@ Estimating heteroscedastic variances in linear models, JASA 70, 1975, DOI
 """
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
 from graphslam.core.arrays import IntArray
 from graphslam.core.config import OdometryConfig
 from graphslam.core.geometry import Array
-from graphslam.core.motion_models import RATES
+from graphslam.core.motion_models import RATES, rates_of_config, with_rates
 from graphslam.core.non_negative import non_negative_least_squares
 from graphslam.odometry.increment_sums import transformed
 from graphslam.odometry.mounted_motions import lever_to
-from graphslam.odometry.preintegration import Track, path_sums
+from graphslam.odometry.path_sums import numbered_times, path_sums
+from graphslam.odometry.preintegration import Track, preintegrate_batch
 
+#: a track with the times (n,) at which motions begin and those (n,) at which they end
+Asked: TypeAlias = tuple[Track, IntArray, IntArray]
 #: sigma of the logarithm of an unknown variance, before any data: a factor of ten
 PRIOR_LOG_SIGMA = math.log(10.0)
 #: m, rad: floors of short motions; that of positions is above what cutting readings leaves out
@@ -29,7 +33,7 @@ FLOOR_M, FLOOR_RAD = 5e-4, 1e-4
 #: residuals are cut at so many of their own sigmas: slip is left to the solution
 CLIP_SIGMAS = 3.0
 #: motions whose variances by nine rates are computed at once, and readings in them, at most
-BLOCK, READINGS = 1000, 20_000
+BLOCK, READINGS = 5000, 20_000
 #: a step beyond that of the residuals by themselves changes a variance by such a factor at most
 FARTHEST = 4.0
 #: a median of absolute values, as the sigma of a normal variable
@@ -49,16 +53,22 @@ def without_floors(config: OdometryConfig) -> OdometryConfig:
     return replace(config, floor_sigma_m=FLOOR_M, floor_sigma_rad=FLOOR_RAD)
 
 
+def without_noise(config: OdometryConfig) -> OdometryConfig:
+    """Settings without noise of odometry and without floors."""
+    return without_floors(with_rates(config, np.zeros(len(RATES))))
+
+
 def fit_noise(
-    track: Track,
-    times_ns: tuple[IntArray, IntArray],
+    config: OdometryConfig,
+    known: Array,
+    gained: Array,
     variances: Array,
     normalised: Array,
     redundancy: Array,
     *,
     relax: bool,
 ) -> tuple[OdometryConfig, Array]:
-    """The settings of a track with the noise that its motions show, without floors.
+    """Settings of a track with the noise that its motions show, without floors.
 
     Where this no longer changes them they have the largest restricted likelihood, with a prior: the
     mean variance along each axis is that of the default settings within `PRIOR_LOG_SIGMA`. Without
@@ -66,8 +76,9 @@ def fit_noise(
     of many repetitions leaves of it.
 
     Args:
-        track: of a source that does not state its noise.
-        times_ns: (n,) of the beginnings and of the ends of the motions.
+        config: of a track that does not state its noise.
+        known: variances (n, 3) of the motions by `without_noise`.
+        gained: (n, 3, 9) what they gain by each rate, see `variances_by_rate`.
         variances: (n, 3) of the noise by which the motions were solved.
         normalised: (n, 3) residuals by this noise, see `Residuals`.
         redundancy: (n, 3) see `Residuals`.
@@ -76,14 +87,13 @@ def fit_noise(
     Returns:
         The settings, and the variances (n, 3) of the motions by them.
     """
-    bare = without_floors(with_rates(track.config, np.zeros(len(RATES))))
-    known, gained = motion_variances(track, bare, times_ns), variances_by_rate(track, *times_ns)
+    bare = without_noise(config)
     moved = gained.any(axis=(1, 2))
     if not moved.any():
         return bare, known
     C, R, least, left = gained[moved], variances[moved], known[moved], redundancy[moved]
     squared = clipped(normalised[moved]) ** 2  # expected: true variance / R
-    default = least + C @ [getattr(OdometryConfig(), name) for name in RATES]
+    default = least + C @ rates_of_config(OdometryConfig())
     # the logarithm of the variance, linear around R
     likely = 1.0 - np.mean(np.log(R / default), axis=0)
     prior = 2.0 / PRIOR_LOG_SIGMA**2
@@ -134,7 +144,7 @@ def with_fit_uncertainty(config: OdometryConfig, log_sigma: Array) -> OdometryCo
         config: settings as fitted.
         log_sigma: (3,) of the mean variances along x, y and of turning, see `variance_sigma`.
     """
-    rates = np.array([getattr(config, name) for name in RATES])
+    rates = rates_of_config(config)
     by_residuals = 1.0 - (log_sigma / PRIOR_LOG_SIGMA) ** 2
     return with_rates(config, rates * np.repeat(np.exp(log_sigma**2 * by_residuals), 3))
 
@@ -159,47 +169,68 @@ def clipped(normalised: Array) -> Array:
     return np.asarray(np.clip(normalised, -cut, cut))
 
 
-def with_rates(config: OdometryConfig, rates: Array) -> OdometryConfig:
-    """Settings with other rates (9,) of the noise, in the order of `RATES`."""
-    values: dict[str, Any] = dict(zip(RATES, rates.tolist(), strict=True))
-    return replace(config, **values)
-
-
-def motion_variances(
-    track: Track, config: OdometryConfig, times_ns: tuple[IntArray, IntArray]
-) -> Array:
-    """Variances (n, 3) of a track's motions along their axes by other settings."""
-    before, calibration = track.config, track.calibration
-    track.config, track.calibration = config, calibration.held()
+def motion_variances(asked: Sequence[Asked], configs: Sequence[OdometryConfig]) -> list[Array]:
+    """Variances (n, 3) of the motions of different tracks along their axes by other settings."""
+    before = [(track.config, track.calibration) for track, _, _ in asked]
     try:
-        return np.diagonal(track.motions(*times_ns).cov, axis1=1, axis2=2).copy()
+        for (track, _, _), config in zip(asked, configs, strict=True):
+            track.config, track.calibration = config, track.calibration.held()
+        covs = [motions.cov for motions in preintegrate_batch(asked)]
+        return [np.diagonal(cov, axis1=1, axis2=2).copy() for cov in covs]
     finally:
-        track.config, track.calibration = before, calibration
+        for (track, _, _), (config, calibration) in zip(asked, before, strict=True):
+            track.config, track.calibration = config, calibration
 
 
-def variances_by_rate(track: Track, start_ns: IntArray, end_ns: IntArray) -> Array:
-    """What the variances (n, 3) of motions gain by each rate of `RATES`, (n, 3, 9).
+def variances_by_rate(asked: Sequence[Asked]) -> list[Array]:
+    """What the variances (n, 3) of motions gain by each rate of `RATES`, (n, 3, 9) of each track.
 
-    Args:
-        track: odometry of two readings at least.
-        start_ns: (n,) in ascending order.
-        end_ns: (n,) later than these.
+    ``asked``: tracks of two readings at least, with the times (n,) in ascending order at which
+    motions begin, and those (n,) later than these at which they end.
     """
-    found = [np.zeros((0, 3, len(RATES)))]
-    # nine covariances of every reading in between
-    passed = np.searchsorted(track.times, start_ns)
-    number = np.arange(len(start_ns)) // BLOCK + (passed - passed[:1]) // READINGS
-    for block in np.split(np.arange(len(start_ns)), np.flatnonzero(np.diff(number)) + 1):
-        start, end = start_ns[block], end_ns[block]
-        start, end, mount = track.odometry_spans(start, end)
-        times, at = np.unique(np.concatenate([start, end]), return_inverse=True)
-        sums, _ = path_sums([track], [times], by_rate=True)
-        motions = sums.motions_between(*np.split(at, 2))
+    found = [[np.zeros((0, 3, len(RATES)))] for _ in asked]
+    for together in _blocks(asked):
+        tracks = [asked[k][0] for k, _ in together]
+        spans = [
+            asked[k][0].odometry_spans(asked[k][1][block], asked[k][2][block])
+            for k, block in together
+        ]
+        start_ns, end_ns, mounts = zip(*spans, strict=True)
+        times, start, end = numbered_times(start_ns, end_ns)
+        sums, _ = path_sums(tracks, times, by_rate=True)
+        motions, mount = sums.motions_between(start, end), np.concatenate(mounts)
         covs = motions.cov
         if mount.any():
             covs = transformed(covs, lever_to(motions.delta, mount))
-        found.append(np.diagonal(covs, axis1=2, axis2=3).mT)
-    return np.concatenate(found)
+        variances = np.diagonal(covs, axis1=2, axis2=3).mT
+        ends = np.cumsum([len(one) for one in start_ns])[:-1]
+        for (k, _), own in zip(together, np.split(variances, ends), strict=True):
+            found[k].append(own)
+    return [np.concatenate(parts) for parts in found]
+
+
+def _blocks(asked: Sequence[Asked]) -> Iterator[list[tuple[int, IntArray]]]:
+    """Motions of tracks that are alike, to be summed together: numbers of tracks and of motions.
+
+    There are nine covariances of every reading in between, so these are few.
+    """
+    together: list[tuple[int, IntArray]] = []
+    key, sizes = None, np.zeros(2, dtype=np.int64)
+    for k, (track, start_ns, end_ns) in enumerate(asked):
+        passed = np.searchsorted(track.times, start_ns)
+        number = np.arange(len(start_ns)) // BLOCK + (passed - passed[:1]) // READINGS
+        for block in np.split(np.arange(len(start_ns)), np.flatnonzero(np.diff(number)) + 1):
+            if not len(block):
+                continue
+            last = np.searchsorted(track.times, end_ns[block].max())
+            own = np.array([len(block), int(last - passed[block[0]])])
+            if together and (track.batch_key != key or (sizes + own > (BLOCK, READINGS)).any()):
+                yield together
+                together, sizes = [], 0 * sizes
+            together.append((k, block))
+            key, sizes = track.batch_key, sizes + own
+    if together:
+        yield together
 
 
 def _non_negative(A: Array, b: Array) -> Array:

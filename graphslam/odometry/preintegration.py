@@ -31,20 +31,19 @@ from graphslam.core.motion_models import (
     nominal_calibration,
     parameter_cov,
     rows_of_twists,
-    unit_error_covs,
+    with_rates,
 )
 from graphslam.core.records import Motion, Trajectory
 from graphslam.odometry.coarse_motions import coarse_motions
-from graphslam.odometry.increment_sums import IncrementSums, Motions, PathSums
+from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.integration_windows import in_windows
-from graphslam.odometry.mounted_motions import calibration_covs, of_mount
+from graphslam.odometry.mounted_motions import of_mount
+from graphslam.odometry.path_sums import LATENCY_STEP_NS, SumsAtStates, numbered_times
 from graphslam.odometry.readings import Readings
 
 #: m and rad: sigma of the motion of a robot that reports none
 STANDING_SIGMA = 1e-4
 
-#: ns: step of the difference quotient by latency; about one period of common odometry
-LATENCY_STEP_NS = 50_000_000
 #: of so many motions a track is integrated by itself: NumPy's cost per call no longer counts, but
 #: whether arrays fit into the processor's cache does
 MANY_MOTIONS = 1000
@@ -159,9 +158,12 @@ class Track(Readings):
             return 0
         return round(float(known.mean[self._mount_slice.stop]) * 1e9)
 
-    def increments(self, rows: Array, calibration: Array) -> Increments:
-        """Increments (n) of rows (n, k), by calibration parameters (p,) or (n, p)."""
-        made = MOTION_SOURCES[self.source](rows, calibration, self._robot, self.config)
+    def increments(self, rows: Array, calibration: Array, rates: Array | None = None) -> Increments:
+        """Increments (n) of rows (n, k), by calibration parameters (p,) or (n, p).
+
+        ``rates`` (n, 9): of the model error, in place of those of the settings.
+        """
+        made = MOTION_SOURCES[self.source](rows, calibration, self._robot, self.config, rates)
         if self.config.parameter_noise == "white" and self.source != "given":
             noise = parameter_cov(self.source, rows, self._robot, self.config)
             made = replace(made, cov=made.cov + noise)
@@ -267,19 +269,21 @@ class Track(Readings):
 
     def motions_among(self, times_ns: IntArray) -> Callable[[IntArray, IntArray], Motions]:
         """`motions` between any of these times (n,), ascending; what they share is summed once."""
-        sums = _SumsAtStates([self], [times_ns])
+        sums = SumsAtStates([self], [times_ns])
         return lambda start_ns, end_ns: sums.motions(
             np.searchsorted(times_ns, start_ns), np.searchsorted(times_ns, end_ns)
         )
 
     @property
     def batch_key(self) -> Hashable:
-        """Tracks with equal keys can be integrated together: only data and calibration differ.
+        """Tracks with equal keys can be integrated together.
 
-        Tracks of wheels are never integrated together: their geometry is of the robot.
+        Only their data, calibrations and rates of noise differ. Tracks of wheels are never
+        integrated together: their geometry is of the robot.
         """
         own = self if self.source == "wheels" else None
-        return self.source, len(self) > 1, len(self.calibration.mean), self.config, own
+        alike = with_rates(self.config, np.zeros(len(RATES)))
+        return self.source, len(self) > 1, len(self.calibration.mean), alike, own
 
     def coarse_motions(
         self,
@@ -362,88 +366,5 @@ def _motions(
     tracks: Sequence[Track], start_ns: Sequence[IntArray], end_ns: Sequence[IntArray]
 ) -> Motions:
     """`preintegrate_batch` tracks with one `Track.batch_key`, track after track."""
-    times, starts, ends, passed = [], [], [], 0
-    for start, end in zip(start_ns, end_ns, strict=True):
-        needed, at = np.unique(np.concatenate([start, end]), return_inverse=True)
-        times.append(needed)
-        starts.append(passed + at[: len(start)])
-        ends.append(passed + at[len(start) :])
-        passed += len(needed)
-    return _SumsAtStates(tracks, times).motions(np.concatenate(starts), np.concatenate(ends))
-
-
-class _SumsAtStates:
-    """Sums of tracks with one `Track.batch_key` up to times of states, and motions between them.
-
-    The tracks keep their calibration as long as they are asked for motions.
-    """
-
-    def __init__(self, tracks: Sequence[Track], times_ns: Sequence[IntArray]) -> None:
-        """Sum up; times (n,) of each track, ascending. They are numbered track after track."""
-        self._tracks = tracks
-        late = [times - track.latency_ns for track, times in zip(tracks, times_ns, strict=True)]
-        self._track_of = np.repeat(np.arange(len(tracks)), [len(times) for times in late])
-        self._sums, self._earlier = path_sums(tracks, late)
-
-    def motions(self, start: IntArray, end: IntArray) -> Motions:
-        """The motions (m) between times of the same track, by their numbers (m,)."""
-        a, b, which = np.minimum(start, end), np.maximum(start, end), self._track_of[start]
-        found, tracks = self._sums.motions_between(a, b), self._tracks
-        delta, cov, d_cal, length = found.delta, found.cov, found.d_cal, found.length_m
-        if tracks[0].is_mounted:
-            mount = np.array([track.mount for track in tracks])[which]
-            change = between(self._earlier[a], self._earlier[b]) - delta
-            change[:, 2] = wrap(change[:, 2])
-            observable = np.array([not track.has_burst_stamps for track in tracks])
-            by_latency = change * np.where(observable, 1e9 / LATENCY_STEP_NS, 0.0)[which, None]
-            delta, cov, d_cal = of_mount(delta, cov, d_cal, mount, by_latency)
-        known = np.array([track.calibration.cov for track in tracks])
-        cov = (cov + cov.mT) / 2 + calibration_covs(d_cal, known, which)
-        moved, floor = (length > 0) | (delta[:, 2] != 0), tracks[0].floor_cov
-        cov = cov + np.where(moved[:, None, None], floor, tracks[0].floor_cov_of(False))
-        back = end < start
-        if back.any():
-            cov[back] = inverse_cov(delta[back], cov[back])
-            d_cal[back] = inverse_jacobian(delta[back]) @ d_cal[back]
-            delta[back] = inverse(delta[back])
-        return Motions(delta, cov, d_cal, length)
-
-
-def path_sums(
-    tracks: Sequence[Track], times: Sequence[IntArray], *, by_rate: bool = False
-) -> tuple[PathSums, Array]:
-    """Sums up to times (n,) of each track's clock, from a reading before all of them.
-
-    The tracks have one `Track.batch_key`; their sums follow each other, and so do the poses (n, 3)
-    at times `LATENCY_STEP_NS` earlier. Covariances are those of the tracks, or ``by_rate`` (n, 9,
-    3, 3), see `unit_error_covs`.
-    """
-    p, counts = tracks[0].increment_parameters, [len(t) for t in times]
-    n = sum(counts)
-    if len(tracks[0]) < 2:
-        zeros, covs = np.zeros((n, 3)), np.zeros((n, *(len(RATES),) * by_rate, 3, 3))
-        of = np.zeros(n, dtype=np.int64)
-        return PathSums(
-            zeros, covs, np.zeros((n, 3, p)), np.zeros(n), covs, covs, of, zeros
-        ), zeros  # fmt: skip
-    spans = [
-        track.span(np.array([when, when - LATENCY_STEP_NS]))
-        for track, when in zip(tracks, times, strict=True)
-    ]
-    sizes = [len(span.whole) for span in spans]
-    firsts, w = np.cumsum([0, *sizes[:-1]], dtype=np.int64), sum(sizes)
-    # all whole rows, then the parts at the times, then the parts at the earlier times
-    parts = np.hstack([span.part for span in spans])
-    rows = np.concatenate([*(span.whole for span in spans), *parts])
-    of_whole, of_time = (np.repeat(np.arange(len(tracks)), each) for each in (sizes, counts))
-    mean = np.array([track.calibration.mean[:p] for track in tracks])
-    of = np.concatenate([of_whole, of_time, of_time])
-    made = tracks[0].increments(rows, mean[0] if len(tracks) == 1 else mean[of])
-    if by_rate:
-        covs = unit_error_covs(tracks[0].source, rows, mean[0], tracks[0]._robot)
-        made = replace(made, cov=covs)
-    first = firsts[of_time]
-    index, index_earlier = np.hstack([span.index for span in spans]) + first
-    sums = IncrementSums(made.part(0, w), firsts[of_whole])
-    earlier = sums.poses(index_earlier, first, made.delta[w + n :])
-    return sums.query(index, first, made.part(w, w + n)), earlier
+    times, starts, ends = numbered_times(start_ns, end_ns)
+    return SumsAtStates(tracks, times).motions(starts, ends)

@@ -28,7 +28,8 @@ from graphslam.core.motion_models import Calibration, further_calibration, nomin
 from graphslam.core.record import replace
 from graphslam.core.records import Motion, Trajectory
 from graphslam.odometry.increment_sums import Motions
-from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, path_sums
+from graphslam.odometry.path_sums import LATENCY_STEP_NS, path_sums
+from graphslam.odometry.preintegration import Track
 
 
 class SeveralLasersTrack(Track):

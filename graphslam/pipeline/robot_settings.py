@@ -9,11 +9,11 @@ from graphslam.core.config import Config, KeyframeConfig, OdometryConfig, RobotC
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
-from graphslam.core.motion_models import RATES
+from graphslam.core.motion_models import RATES, with_rates
 from graphslam.core.records import RelativePose, Scan, Sighting
 from graphslam.logs import LogSet
 from graphslam.logs.stated_noise import StatedNoise
-from graphslam.odometry.noise_estimation import rates_of, with_rates
+from graphslam.odometry.noise_estimation import rates_of
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.several_lasers import SeveralLasersTrack
 from graphslam.perception.robot_outlines import outline_of

@@ -19,7 +19,7 @@ from graphslam.estimation.log_noise import MOTION, LogNoise, has_state_at_every_
 from graphslam.estimation.motion_noise import (
     BEGIN_SIGMA,
     NoiseFit,
-    fit_track_noise,
+    fit_odometry_noise,
     measured_motion_noise,
     stated_robots,
 )
@@ -134,7 +134,7 @@ def _estimated(
     for name in stated:
         tracks[name].config = without_floors(tracks[name].config)
     measured: dict[Source, Array] = {}
-    fits: dict[str, NoiseFit | None] = {}
+    fits: dict[str, NoiseFit] = {}
     for _ in range(rounds):
         initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
@@ -148,24 +148,24 @@ def _estimated(
         new = _sighting_noise(posterior, noise)
         change = _largest_change(noise, new)
         noise = new
-        covs, odometry_change = graph.calibration_covariances(posterior), 0.0
+        covs = graph.calibration_covariances(posterior)
         for name, track in tracks.items():
             track.calibration = replace(calibrations[name], cov=covs[name])
             if name in stated:
                 factors = measured_motion_noise(track, name, posterior)
                 if factors is not None:
                     measured[name, MOTION] = factors
-                continue
-            fit = fits[name] = fit_track_noise(track, name, posterior, relax=is_white(noise))
+        open_ones = {name: track for name, track in tracks.items() if name not in stated}
+        fits = fit_odometry_noise(open_ones, posterior, relax=is_white(noise))
+        for track in open_ones.values():
             track.config = without_floors(track.config)
-            odometry_change = max(odometry_change, fit.change if fit else 0.0)
+        odometry_change = max((fit.change for fit in fits.values()), default=0.0)
         if max(change, odometry_change) < CONVERGED_SHARE:
             break
         if not is_white(noise) and odometry_change < UNSETTLED_SHARE:
             break
     for name, fit in fits.items():
-        if fit is not None:
-            tracks[name].config = with_fit_uncertainty(tracks[name].config, fit.log_sigma)
+        tracks[name].config = with_fit_uncertainty(tracks[name].config, fit.log_sigma)
     for source, found in noise.items():
         measured[source] = found.white + found.shared
     final = {source: _cautious(found, config) for source, found in noise.items()}

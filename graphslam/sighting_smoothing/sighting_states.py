@@ -30,7 +30,8 @@ from graphslam.estimation.motion_noise import MIN_SIGMA
 from graphslam.odometry.calibration_jacobian import at_estimated_motion
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.interpolation import final_at
-from graphslam.odometry.preintegration import LATENCY_STEP_NS, Track, preintegrate_batch
+from graphslam.odometry.path_sums import LATENCY_STEP_NS
+from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.perception.sightings import sighting_observation
 from graphslam.pipeline.sighting_batches import transport_batch
 

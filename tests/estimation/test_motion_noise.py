@@ -7,7 +7,7 @@ import pytest
 
 import graphslam
 from graphslam.core.config import OdometryConfig, RobotConfig
-from graphslam.core.motion_models import RATES
+from graphslam.core.motion_models import RATES, with_rates
 from graphslam.core.records import (
     Association,
     Estimate,
@@ -20,7 +20,7 @@ from graphslam.core.records import (
 from graphslam.estimation.motion_arrays import increments_of
 from graphslam.estimation.motion_noise import (
     FEW_MOTIONS,
-    fit_track_noise,
+    fit_odometry_noise,
     measured_motion_noise,
     middle_of_paths,
     scale_motion_noise,
@@ -30,7 +30,6 @@ from graphslam.odometry.noise_estimation import (
     motion_variances,
     variance_sigma,
     with_fit_uncertainty,
-    with_rates,
 )
 from graphslam.odometry.preintegration import Track
 from graphslam.simulation import load_scenario, simulate
@@ -76,7 +75,7 @@ def driven():
         Step(time_ns=int(end), motions={"r": made.one(k, int(begin), int(end))})
         for k, (begin, end) in enumerate(zip(*times, strict=True))
     ]
-    stated = motion_variances(track, track.config, times)
+    (stated,) = motion_variances([(track, *times)], [track.config])
     steps = scale_motion_noise(steps, {"r": np.full(3, FACTOR)})
     return track, times, steps, stated
 
@@ -85,8 +84,9 @@ def test_noise_is_found_by_the_covariances_that_the_solution_was_made_with():
     """Nine tenths of the noise are absorbed. By the stated variances, a quarter of those solved
     with, nothing at all would be left in the residuals, and noise comes out five times as large."""
     track, times, steps, stated = driven()
-    fit_track_noise(track, "r", Solution(steps, stated), relax=False)
-    found = motion_variances(track, track.config, times) / stated
+    fit_odometry_noise({"r": track}, Solution(steps, stated), relax=False)
+    (found,) = motion_variances([(track, *times)], [track.config])
+    found = found / stated
     np.testing.assert_allclose(found[:, [0, 2]].mean(axis=0), FACTOR**2, rtol=0.15)
 
 
@@ -95,18 +95,16 @@ def test_few_motions_tell_of_their_noise_too():
     were asked for) such logs had a NEES of up to 43."""
     track, _, steps, stated = driven()
     before = track.config
-    assert (
-        fit_track_noise(track, "r", Solution(steps[:FEW_MOTIONS], stated), relax=False) is not None
-    )
+    few = Solution(steps[:FEW_MOTIONS], stated)
+    assert fit_odometry_noise({"r": track}, few, relax=False).keys() == {"r"}
     assert track.config != before
 
 
 def test_hardly_any_motions_leave_the_noise_as_it_is():
     track, _, steps, stated = driven()
     before = track.config
-    assert (
-        fit_track_noise(track, "r", Solution(steps[: FEW_MOTIONS - 1], stated), relax=False) is None
-    )
+    fewer = Solution(steps[: FEW_MOTIONS - 1], stated)
+    assert fit_odometry_noise({"r": track}, fewer, relax=False) == {}
     assert track.config is before
 
 

@@ -34,7 +34,7 @@ def test_noise_of_velocities_becomes_that_of_motions(tmp_path):
     for message in log.messages():
         track.add(message)
     begin, end = np.array([10 * PERIOD_NS]), np.array([20 * PERIOD_NS])
-    variances = motion_variances(track, without_floors(track.config), (begin, end))[0]
+    (variances,) = motion_variances([(track, begin, end)], [without_floors(track.config)])[0]
     assert np.sqrt(variances[[0, 2]]) == pytest.approx(0.1 * np.sqrt(10) * SIGMAS[[0, 2]], rel=0.1)
     assert track.config.k_phi_s == pytest.approx(SENSIBLE[2] * 0.1, rel=0.01)
 

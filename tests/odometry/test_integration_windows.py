@@ -5,8 +5,9 @@ import pytest
 
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import compose
+from graphslam.core.motion_models import with_rates
 from graphslam.core.records import OdometryPose
-from graphslam.odometry import integration_windows, preintegration, readings
+from graphslam.odometry import integration_windows, path_sums, readings
 from graphslam.odometry.noise_estimation import variances_by_rate
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 
@@ -37,14 +38,14 @@ def asked():
 
 def sums_of(function, monkeypatch):
     """What a function gives, and the largest number of increments that were summed at once."""
-    most, whole = [0], preintegration.IncrementSums
+    most, whole = [0], path_sums.IncrementSums
 
     def counted(increments, first):
         most.append(len(increments.delta))
         return whole(increments, first)
 
     with monkeypatch.context() as patch:
-        patch.setattr(preintegration, "IncrementSums", counted)
+        patch.setattr(path_sums, "IncrementSums", counted)
         return function(), max(most)
 
 
@@ -58,6 +59,24 @@ def test_windows_change_nothing_but_what_is_summed_at_once(asked, monkeypatch):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-12)
 
 
+def test_tracks_with_other_rates_of_noise_are_summed_together_as_by_themselves(asked, monkeypatch):
+    """Each keeps its own rates; by those of the first the other's noise is off by a factor."""
+    (one, *first), (other, *second) = asked
+    with monkeypatch.context() as patch:
+        patch.setattr(other, "config", with_rates(other.config, np.linspace(1e-4, 2e-3, 9)))
+        both = [(one, *first), (other, *second)]
+        together, most = sums_of(lambda: preintegrate_batch(both), monkeypatch)
+        alone = [preintegrate_batch([each])[0] for each in both]
+        forth = [(track, np.minimum(a, b), np.maximum(a, b)) for track, a, b in both]
+        forth = [(track, np.sort(a), np.sort(b)) for track, a, b in forth]
+        rates = variances_by_rate(forth)
+        alone_rates = [variances_by_rate([each])[0] for each in forth]
+    assert most > 5000  # both at once
+    for found, expected in zip(together, alone, strict=True):
+        np.testing.assert_allclose(found.cov, expected.cov, atol=1e-12)
+    np.testing.assert_allclose(np.concatenate(rates), np.concatenate(alone_rates), atol=1e-10)
+
+
 def test_motions_that_all_reach_to_the_end_are_not_cut_into_windows(asked, monkeypatch):
     """Each window would sum up all that comes after it, again."""
     monkeypatch.setattr(integration_windows, "MOST_READINGS", 1000)
@@ -69,9 +88,9 @@ def test_motions_that_all_reach_to_the_end_are_not_cut_into_windows(asked, monke
 def test_variances_by_rate_hold_few_readings_at_once(asked, monkeypatch):
     one = asked[0][0]
     begin = np.arange(1, 28 * S, S // 7)
-    whole = variances_by_rate(one, begin, begin + S // 2)
+    whole = variances_by_rate([(one, begin, begin + S // 2)])[0]
     monkeypatch.setattr("graphslam.odometry.noise_estimation.READINGS", 500)
-    parts, few = sums_of(lambda: variances_by_rate(one, begin, begin + S // 2), monkeypatch)
+    parts, few = sums_of(lambda: variances_by_rate([(one, begin, begin + S // 2)])[0], monkeypatch)
     assert few < 700
     np.testing.assert_allclose(whole, parts, atol=1e-10)
 

@@ -13,7 +13,8 @@ from graphslam.core.motion_models import nominal_calibration
 from graphslam.core.records import OdometryIncrement, OdometryPose, WheelAngles
 from graphslam.odometry.mounted_motions import calibration_covs
 from graphslam.odometry.noise_estimation import without_floors
-from graphslam.odometry.preintegration import LATENCY_STEP_NS, STANDING_SIGMA, Track
+from graphslam.odometry.path_sums import LATENCY_STEP_NS
+from graphslam.odometry.preintegration import STANDING_SIGMA, Track
 
 S = 1_000_000_000
 ROBOT = RobotConfig(wheel_radius_left_m=0.11, wheel_radius_right_m=0.1, axle_m=0.6)

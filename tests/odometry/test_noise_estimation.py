@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from graphslam.core.config import OdometryConfig, RobotConfig
-from graphslam.core.motion_models import RATES
+from graphslam.core.motion_models import RATES, with_rates
 from graphslam.core.records import OdometryPose, WheelAngles
 from graphslam.odometry.noise_estimation import (
     motion_variances,
     variances_by_rate,
-    with_rates,
-    without_floors,
+    without_noise,
 )
 from graphslam.odometry.preintegration import Track
 
@@ -47,11 +46,11 @@ def test_variances_by_rate_are_those_that_motions_gain(kind, mounted):
     track = driven(kind, mounted=mounted)
     times = 100 * S + np.arange(0, 39 * S, 730_000_000)
     between = times[:-1], times[1:]
-    bare = without_floors(with_rates(track.config, np.zeros(len(RATES))))
-    none = motion_variances(track, bare, between)
-    found = variances_by_rate(track, *between)
+    bare = without_noise(track.config)
+    asked = [(track, *between)]
+    (none,), (found,) = motion_variances(asked, [bare]), variances_by_rate(asked)
     assert found.shape == (len(times) - 1, 3, len(RATES))
     for k, one in enumerate(np.eye(len(RATES))):
-        gained = motion_variances(track, with_rates(bare, one), between) - none
+        gained = motion_variances(asked, [with_rates(bare, one)])[0] - none
         np.testing.assert_allclose(found[:, :, k], gained, atol=1e-9)  # of 0.7
     assert found.min() > -1e-9
