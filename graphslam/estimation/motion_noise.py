@@ -155,8 +155,9 @@ def fit_odometry_noise(
     every = list(asked.values())
     known = motion_variances(every, [without_noise(track.config) for track, _, _ in every])
     fits = {}
-    for robot, without, gained in zip(asked, known, variances_by_rate(every), strict=True):
-        track, (variances, normalised, left) = tracks[robot], shown[robot]
+    for (robot, (track, begin, end)), without in zip(asked.items(), known, strict=True):
+        gained = variances_by_rate(track, begin, end)
+        variances, normalised, left = shown[robot]
         track.config, after = fit_noise(
             track.config, without, gained, variances, normalised, left, relax=relax
         )

@@ -8,7 +8,7 @@ Estimating heteroscedastic variances in linear models, JASA 70, 1975, DOI
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -21,7 +21,7 @@ from graphslam.core.motion_models import RATES, rates_of_config, with_rates
 from graphslam.core.non_negative import non_negative_least_squares
 from graphslam.odometry.increment_sums import transformed
 from graphslam.odometry.mounted_motions import lever_to
-from graphslam.odometry.path_sums import numbered_times, path_sums
+from graphslam.odometry.path_sums import path_sums
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 
 #: a track with the times (n,) at which motions begin and those (n,) at which they end
@@ -33,7 +33,7 @@ FLOOR_M, FLOOR_RAD = 5e-4, 1e-4
 #: residuals are cut at so many of their own sigmas: slip is left to the solution
 CLIP_SIGMAS = 3.0
 #: motions whose variances by nine rates are computed at once, and readings in them, at most
-BLOCK, READINGS = 5000, 20_000
+BLOCK, READINGS = 1000, 20_000
 #: a step beyond that of the residuals by themselves changes a variance by such a factor at most
 FARTHEST = 4.0
 #: a median of absolute values, as the sigma of a normal variable
@@ -182,55 +182,29 @@ def motion_variances(asked: Sequence[Asked], configs: Sequence[OdometryConfig]) 
             track.config, track.calibration = config, calibration
 
 
-def variances_by_rate(asked: Sequence[Asked]) -> list[Array]:
-    """What the variances (n, 3) of motions gain by each rate of `RATES`, (n, 3, 9) of each track.
+def variances_by_rate(track: Track, start_ns: IntArray, end_ns: IntArray) -> Array:
+    """What the variances (n, 3) of motions gain by each rate of `RATES`, (n, 3, 9).
 
-    ``asked``: tracks of two readings at least, with the times (n,) in ascending order at which
-    motions begin, and those (n,) later than these at which they end.
+    Args:
+        track: odometry of two readings at least.
+        start_ns: (n,) in ascending order.
+        end_ns: (n,) later than these.
     """
-    found = [[np.zeros((0, 3, len(RATES)))] for _ in asked]
-    for together in _blocks(asked):
-        tracks = [asked[k][0] for k, _ in together]
-        spans = [
-            asked[k][0].odometry_spans(asked[k][1][block], asked[k][2][block])
-            for k, block in together
-        ]
-        start_ns, end_ns, mounts = zip(*spans, strict=True)
-        times, start, end = numbered_times(start_ns, end_ns)
-        sums, _ = path_sums(tracks, times, by_rate=True)
-        motions, mount = sums.motions_between(start, end), np.concatenate(mounts)
+    found = [np.zeros((0, 3, len(RATES)))]
+    # nine covariances of every reading in between
+    passed = np.searchsorted(track.times, start_ns)
+    number = np.arange(len(start_ns)) // BLOCK + (passed - passed[:1]) // READINGS
+    for block in np.split(np.arange(len(start_ns)), np.flatnonzero(np.diff(number)) + 1):
+        start, end = start_ns[block], end_ns[block]
+        start, end, mount = track.odometry_spans(start, end)
+        times, at = np.unique(np.concatenate([start, end]), return_inverse=True)
+        sums, _ = path_sums([track], [times], by_rate=True)
+        motions = sums.motions_between(*np.split(at, 2))
         covs = motions.cov
         if mount.any():
             covs = transformed(covs, lever_to(motions.delta, mount))
-        variances = np.diagonal(covs, axis1=2, axis2=3).mT
-        ends = np.cumsum([len(one) for one in start_ns])[:-1]
-        for (k, _), own in zip(together, np.split(variances, ends), strict=True):
-            found[k].append(own)
-    return [np.concatenate(parts) for parts in found]
-
-
-def _blocks(asked: Sequence[Asked]) -> Iterator[list[tuple[int, IntArray]]]:
-    """Motions of tracks that are alike, to be summed together: numbers of tracks and of motions.
-
-    There are nine covariances of every reading in between, so these are few.
-    """
-    together: list[tuple[int, IntArray]] = []
-    key, sizes = None, np.zeros(2, dtype=np.int64)
-    for k, (track, start_ns, end_ns) in enumerate(asked):
-        passed = np.searchsorted(track.times, start_ns)
-        number = np.arange(len(start_ns)) // BLOCK + (passed - passed[:1]) // READINGS
-        for block in np.split(np.arange(len(start_ns)), np.flatnonzero(np.diff(number)) + 1):
-            if not len(block):
-                continue
-            last = np.searchsorted(track.times, end_ns[block].max())
-            own = np.array([len(block), int(last - passed[block[0]])])
-            if together and (track.batch_key != key or (sizes + own > (BLOCK, READINGS)).any()):
-                yield together
-                together, sizes = [], 0 * sizes
-            together.append((k, block))
-            key, sizes = track.batch_key, sizes + own
-    if together:
-        yield together
+        found.append(np.diagonal(covs, axis1=2, axis2=3).mT)
+    return np.concatenate(found)
 
 
 def _non_negative(A: Array, b: Array) -> Array:

@@ -48,7 +48,7 @@ def test_variances_by_rate_are_those_that_motions_gain(kind, mounted):
     between = times[:-1], times[1:]
     bare = without_noise(track.config)
     asked = [(track, *between)]
-    (none,), (found,) = motion_variances(asked, [bare]), variances_by_rate(asked)
+    (none,), found = motion_variances(asked, [bare]), variances_by_rate(track, *between)
     assert found.shape == (len(times) - 1, 3, len(RATES))
     for k, one in enumerate(np.eye(len(RATES))):
         gained = motion_variances(asked, [with_rates(bare, one)])[0] - none
