@@ -170,14 +170,14 @@ class CalibrationGraph:
     def _linearise(self, made: Mapping[str, Increments], now: Mapping[str, Calibration]) -> None:
         """Put motions in the graph that are ``made`` with calibrations ``now``, see above."""
         graph, values = self._builder.graph, self._values
-        unit = gtsam.noiseModel.Unit.Create(3)
+        unit, poses_at = gtsam.noiseModel.Unit.Create(3), self._builder.pose_reader(values)
         self._made, self._now, self._linear_at = made, now, values
         for robot, use in self._free.items():
             values.update(self._keys[robot], now[robot].mean[use])
             if robot not in made:
                 continue
             keys = np.array(self._builder.state_keys(robot), dtype=np.int64)
-            linear = linear_motions(made[robot], self._builder.poses_at(values, keys), use)
+            linear = linear_motions(made[robot], poses_at(keys), use)
             for (index, last, key), (A_x, R, A_c, b) in zip(
                 self._motions[robot], linear, strict=True
             ):
@@ -345,7 +345,8 @@ class CalibrationGraph:
             blocks = marginals_of(builder.graph, self._values, *pairs)
         except RuntimeError as error:
             raise builder.explain(error) from error
-        return Posterior(self._steps, self._made, builder, self._values, blocks, free)
+        solved = self._values, blocks, free, builder.pose_reader(self._values)
+        return Posterior(self._steps, self._made, builder, *solved)
 
     def weigh_lines(self) -> None:
         """Give lines the noise that their residuals in the last solution show, from now on.
@@ -359,8 +360,8 @@ class CalibrationGraph:
 
     def line_residuals(self) -> LineResiduals:
         """Residuals of lines in the last solution; for errors see `solved`."""
-        found = self.solved()
-        return LineResiduals(found.builder, found.values, found.root, found.calibrations)
+        s = self.solved()
+        return LineResiduals(s.builder, s.values, s.root, s.calibrations, s.poses_at)
 
     def solved(self) -> SolvedGraph:
         """The last solution.

@@ -6,7 +6,7 @@ with both parts do residuals tell how large the noise is (C. R. Rao, Estimation 
 covariance components in linear models, JASA 67, 1972, DOI 10.1080/01621459.1972.10481212).
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -63,7 +63,7 @@ class Posterior:
     ``steps``: what was solved. ``made``: robot -> the motions of it, as they were solved, by the
     calibration that was found.
     ``calibrations``: robot -> key of its calibration, and which of its parameters (p,) that has.
-    ``blocks`` are of errors along the axes of each pose.
+    ``blocks`` are of errors along the axes of each pose; ``poses_at``: `RecordedGraph.pose_reader`.
     """
 
     steps: Sequence[Step]
@@ -72,6 +72,7 @@ class Posterior:
     values: gtsam.Values
     blocks: CovarianceBlocks
     calibrations: Mapping[str, tuple[int, IntArray]]
+    poses_at: Callable[[IntArray], Array]
 
     def motions(self, robot: str, made: Increments, *, over_spans: bool = False) -> Residuals:
         """Residuals of all motions of a robot, along the axes of their starts.
@@ -136,7 +137,7 @@ class Posterior:
     def _values(self, keys: Sequence[int], dim: int) -> Array:
         """Values (n, dim) of states or of points."""
         if dim == 3:
-            return self.builder.poses_at(self.values, np.array(keys, dtype=np.int64))
+            return self.poses_at(np.array(keys, dtype=np.int64))
         unique, where = np.unique(np.array(keys, dtype=np.int64), return_inverse=True)
         return np.array([factors.read(self.values, key, dim) for key in unique.tolist()])[where]
 

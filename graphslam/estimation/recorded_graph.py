@@ -6,7 +6,7 @@ of thousands.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -167,13 +167,16 @@ class RecordedGraph(BatchGraph):
         self.rows += MODELS["line"].rows
         self._lines.append((key, factors.landmark_key(int(seen.target)), seen))
 
-    def poses_at(self, values: gtsam.Values, keys: IntArray) -> Array:
-        """The values (n, 3) of states by their keys (n,); ``values`` are of the whole graph."""
+    def pose_reader(self, values: gtsam.Values) -> Callable[[IntArray], Array]:
+        """What gives the values (n, 3) of states by their keys (n,).
+
+        ``values`` are of the whole graph, and are read once.
+        """
         every = np.concatenate(
             [np.array(self.state_keys(robot), dtype=np.int64) for robot in self.robots]
         )
         poses = factors.read_poses(values)[-len(every) :]
-        return np.asarray(poses[np.searchsorted(every, keys)])
+        return lambda keys: np.asarray(poses[np.searchsorted(every, keys)])
 
     @property
     def observes_walls(self) -> bool:

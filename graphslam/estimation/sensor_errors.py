@@ -200,7 +200,7 @@ class _Part:
         model, robot, n = MODELS[first.model], first.robot, len(observed)
         at = np.array([a.time_ns for _, a in observed], dtype=np.int64)
         number = builder.states.numbers(robot, at)
-        x = builder.poses_at(solved.values, builder.state_key(robot, 0) + number)
+        x = solved.poses_at(builder.state_key(robot, 0) + number)
         t, rows = _targets(solved, observed, model.dim)
         z, cov = (np.array([getattr(a, name) for _, a in observed]) for name in ("z", "cov"))
         of = np.array([sensors[a.source] for _, a in observed if a.source is not None])
@@ -255,6 +255,6 @@ def _targets(
     for robot in set(names):
         own = np.array([name == robot for name in names])
         number = builder.states.numbers(str(robot), seen_ns[own])
-        poses[own] = builder.poses_at(solved.values, builder.state_key(str(robot), 0) + number)
+        poses[own] = solved.poses_at(builder.state_key(str(robot), 0) + number)
         first[own] = root.states[str(robot)][number]
     return poses, first

@@ -1,11 +1,12 @@
 """A solution of a recorded graph, as what is computed from it afterwards needs it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.motion_models import Calibration
@@ -20,13 +21,15 @@ class SolvedGraph:
     """A graph, the values at its minimum, and the root of its information.
 
     ``calibrations``: robot -> key of its calibration, if any of it is unknown, and what is before
-    any data. Its rows of the root are in the place of a mount's.
+    any data. Its rows of the root are in the place of a mount's. ``poses_at``: see
+    `RecordedGraph.pose_reader`.
     """
 
     builder: RecordedGraph
     values: gtsam.Values
     root: InformationRoot
     calibrations: Mapping[str, tuple[int, Calibration]]
+    poses_at: Callable[[IntArray], Array]
 
     @classmethod
     def of(
@@ -40,7 +43,8 @@ class SolvedGraph:
         keys = {robot: builder.state_keys(robot) for robot in builder.robots}
         marks = {number: factors.landmark_key(number) for number in builder.landmark_dims}
         own = {robot: (key, range(len(prior.cov))) for robot, (key, prior) in calibrations.items()}
-        return cls(builder, values, information_root(rows, keys, marks, own), calibrations)
+        root = information_root(rows, keys, marks, own)
+        return cls(builder, values, root, calibrations, builder.pose_reader(values))
 
     def gradient(self) -> Array:
         """That of half the squared error, (R,) by rows of the root; zero at the very minimum."""
