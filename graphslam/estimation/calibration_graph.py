@@ -35,6 +35,7 @@ from graphslam.estimation.optimisation import (
 from graphslam.estimation.posterior_residuals import Posterior, posterior_pairs
 from graphslam.estimation.recorded_graph import ObservationNoise, RecordedGraph, Source
 from graphslam.estimation.sandwich_covariance import CovarianceFactors, covariance_factors
+from graphslam.estimation.selected_inverse import CliqueRows
 from graphslam.estimation.solved_graph import SolvedGraph
 from graphslam.estimation.surface_bias import with_surface_bias
 from graphslam.estimation.weighed_walls import WeighedWalls
@@ -135,6 +136,7 @@ class CalibrationGraph:
         self._values, self._priors = gtsam.Values(), priors
         # at the last solution, as is the error of the graph that was solved
         self._marginals: JointMarginals | None = None
+        self._rows: tuple[CliqueRows, ...] | None = None  # of the root, if it is known
         self._error = 0.0
         self.line_noise: Mapping[str, Array] = {}
         self._steps = steps
@@ -171,7 +173,7 @@ class CalibrationGraph:
         """Put motions in the graph that are ``made`` with calibrations ``now``, see above."""
         graph, values = self._builder.graph, self._values
         unit, poses_at = gtsam.noiseModel.Unit.Create(3), self._builder.pose_reader(values)
-        self._made, self._now, self._linear_at = made, now, values
+        self._made, self._now, self._linear_at, self._rows = made, now, values, None
         for robot, use in self._free.items():
             values.update(self._keys[robot], now[robot].mean[use])
             if robot not in made:
@@ -220,7 +222,7 @@ class CalibrationGraph:
                 values, error = optimizer.optimize(), optimizer.error()
         except RuntimeError as failed:
             raise builder.explain(failed) from failed
-        self._values, self._error, self._marginals = values, error, None
+        self._values, self._error, self._marginals, self._rows = values, error, None, None
 
     def solution(
         self,
@@ -249,15 +251,14 @@ class CalibrationGraph:
         if marginals:
             self._relinearise()
             half_error = float(builder.graph.error(values))
-        if marginals and bias_m is not None and builder.observes_walls:
-            self.line_noise = fit_line_noise(self.line_residuals())
-            weighed = builder.weigh_walls(values, self.line_noise)
-        if marginals:
+            if bias_m is not None and builder.observes_walls:
+                self.line_noise = fit_line_noise(self.line_residuals())
+                weighed = builder.weigh_walls(values, self.line_noise)
             try:
                 found = marginals_of(builder.graph, values, keep_rows=joint)
             except RuntimeError as error:
                 raise builder.explain(error) from error
-        covs = found.marginals
+        self._rows, covs = found.rows, found.marginals
         means = with_means(values, builder.dims(), covs)
         mounted = self._mount_places() if mounts else {}
         estimate = builder.estimate(means, half_error, found.rows, mounted)
@@ -357,6 +358,7 @@ class CalibrationGraph:
         if self._builder.observes_walls:
             self.line_noise = fit_line_noise(self.line_residuals())
             self._builder.weigh_walls(self._values, self.line_noise)
+            self._rows = None
 
     def line_residuals(self) -> LineResiduals:
         """Residuals of lines in the last solution; for errors see `solved`."""
@@ -372,9 +374,10 @@ class CalibrationGraph:
         builder = self._builder
         self._relinearise()
         try:
-            rows = root_of(builder.graph, self._values)
+            rows = self._rows or root_of(builder.graph, self._values)
         except RuntimeError as error:
             raise builder.explain(error) from error
+        self._rows = None  # they are as large as the graph, and not asked for twice
         priors = {r: (self._keys[r], self._priors[r].part(use)) for r, use in self._free.items()}
         return SolvedGraph.of(builder, self._values, rows, priors)
 
