@@ -20,9 +20,9 @@ from graphslam.core.records import Estimate, Motion, Step, Trajectory
 from graphslam.estimation.calibration_graph import (
     CalibratedSolution,
     CalibrationGraph,
-    at_calibration,
     solve_calibrated,
 )
+from graphslam.estimation.motion_arrays import at_calibration
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.odometry.calibration_jacobian import at_estimated_motion

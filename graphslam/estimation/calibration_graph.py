@@ -83,29 +83,6 @@ def solve_calibrated(
     return CalibratedSolution(*found, problem)
 
 
-def at_calibration(
-    steps: Sequence[Step],
-    now: Mapping[str, Calibration],
-    found: Mapping[str, Calibration],
-) -> tuple[Step, ...]:
-    """Steps whose motions, computed with ``now``, are as the solution has them with ``found``."""
-    moved = {
-        robot: iter(moved_by(made, found[robot].mean - now[robot].mean).delta)
-        for robot, made in increments_of(steps).items()
-        if robot in found and (found[robot].mean != now[robot].mean).any()
-    }
-    return tuple(
-        replace(
-            step,
-            motions={
-                robot: replace(motion, delta=next(moved[robot])) if robot in moved else motion
-                for robot, motion in step.motions.items()
-            },
-        )
-        for step in steps
-    )
-
-
 class CalibrationGraph:
     """The graph of steps with calibrations as variables, whose motions can be exchanged.
 

@@ -1,13 +1,14 @@
 """The motions of a log as arrays: of one robot all at once."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, adjoint, between, inverse, log, rotation3, wrap
-from graphslam.core.motion_models import Increments
+from graphslam.core.motion_models import Calibration, Increments
+from graphslam.core.record import replace
 from graphslam.core.records import Motion, Step
 
 
@@ -48,3 +49,26 @@ def linear_motions(
     h = between(poses[: len(delta)], poses[1 : len(delta) + 1])
     b = -(R @ log(between(delta, h))[:, :, None])[:, :, 0]
     return zip(R @ -adjoint(inverse(h)), R, R @ (-back @ D), b, strict=True)
+
+
+def at_calibration(
+    steps: Sequence[Step],
+    now: Mapping[str, Calibration],
+    found: Mapping[str, Calibration],
+) -> tuple[Step, ...]:
+    """Steps whose motions, computed with ``now``, are as the solution has them with ``found``."""
+    moved = {
+        robot: iter(moved_by(made, found[robot].mean - now[robot].mean).delta)
+        for robot, made in increments_of(steps).items()
+        if robot in found and (found[robot].mean != now[robot].mean).any()
+    }
+    return tuple(
+        replace(
+            step,
+            motions={
+                robot: replace(motion, delta=next(moved[robot])) if robot in moved else motion
+                for robot, motion in step.motions.items()
+            },
+        )
+        for step in steps
+    )

@@ -22,9 +22,9 @@ from graphslam.estimation.calibration_graph import (
     CONVERGED_ERROR,
     CalibratedSolution,
     CalibrationGraph,
-    at_calibration,
 )
 from graphslam.estimation.log_noise import LogNoise
+from graphslam.estimation.motion_arrays import at_calibration
 from graphslam.estimation.motion_noise import (
     fit_motion_noise,
     middle_of_paths,
