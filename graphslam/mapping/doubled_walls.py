@@ -36,10 +36,11 @@ LEAST_M = 0.04
 #: m: of walls that stand twice, at least, and how wide an area they enclose: one wall alone may be
 #: seen from both of its sides
 LEAST_TWICE_M, LEAST_WIDE_M = 3.0, 1.0
-#: how many times the length that lies on others as it is must do so only if displaced. In the
-#: simulated office on five days and in Intel's thirds no piece does
-TWICE_FACTOR = 4.0
-#: of a visit that is compared: those before all
+#: how many times the length that lies on others only as it is must do so only if displaced: for a
+#: doubt, and for a displacement. In the simulated office on five days and in Intel's thirds no piece
+#: lies on others only if displaced; where all furniture of the lab was pushed alike nearly all do
+DOUBT_FACTOR, CLEAR_FACTOR = 0.5, 4.0
+#: in place of a visit's name, of what an earlier map knows
 _BEFORE = ""
 
 
@@ -64,19 +65,27 @@ class Displacement(NamedTuple):
     wide_m: float
 
     @property
+    def is_doubtful(self) -> bool:
+        """Whether walls stand twice, nearly as many as stand once: one of two groups was moved."""
+        return self._is_above(DOUBT_FACTOR)
+
+    @property
     def is_clear(self) -> bool:
-        """Whether the walls stand twice, and not once."""
+        """Whether the walls stand twice, and hardly any once."""
+        return self._is_above(CLEAR_FACTOR)
+
+    def _is_above(self, factor: float) -> bool:
         return bool(
             np.hypot(*self.by) > LEAST_M
-            and self.twice_m > max(LEAST_TWICE_M, TWICE_FACTOR * self.once_m)
+            and self.twice_m > max(LEAST_TWICE_M, factor * self.once_m)
             and self.wide_m > LEAST_WIDE_M
         )
 
 
-def displaced_visits(
+def displacements(
     steps: Sequence[Step], estimate: Estimate, landmarks: LandmarkMap
 ) -> dict[str, Displacement]:
-    """Visits whose walls of the building stand beside those that were seen before.
+    """What lays the walls of each visit on those seen before; without those that saw no others.
 
     A visit is what one robot name saw, as sessions have one each. Each is compared with all before
     it, where their walls belong, and with landmarks that an earlier map knows.
@@ -87,9 +96,10 @@ def displaced_visits(
     (_, before), *visits = _building(steps, estimate, landmarks)
     for visit, own in visits:
         displacement = compare(own, before)
-        if displacement is not None and displacement.is_clear:
+        if displacement is not None:
             found[visit] = displacement
-            own = own._replace(at=own.at + displacement.by)
+            if displacement.is_clear:
+                own = own._replace(at=own.at + displacement.by)
         before = Pieces(*map(np.concatenate, zip(before, own, strict=True)))
     return found
 

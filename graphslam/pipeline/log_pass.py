@@ -91,8 +91,8 @@ class LogPass:
         self.scan_evidence: Mapping[str, ScanEvidence] = {}
         #: landmarks that were moved: number -> the landmark that they were before
         self.moved: Mapping[int, int] = {}
-        #: visits whose walls of the building stand beside those that were seen before
-        self.displaced: Mapping[str, Displacement] = {}
+        #: of visits, from where their walls of the building were seen before
+        self.displacements: Mapping[str, Displacement] = {}
         self.counts: Counter[str] = Counter()
         self.skipped_before: Mapping[str, int] = {}  # by the run that this one goes on with
         self.dropped: Counter[str] = Counter()

@@ -37,7 +37,7 @@ from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.settled import moved_to, settled
 from graphslam.mapping.composite_walls import split_composites
-from graphslam.mapping.doubled_walls import displaced_visits
+from graphslam.mapping.doubled_walls import displacements
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
     merged,
@@ -254,7 +254,7 @@ def _solved(
         estimate = moved_to(minimum.result(), estimate)
     # the minimum may have turned the map as a whole: ends of walls are where they are seen there
     landmarks.update_from(steps, estimate)
-    scan_log.displaced = displaced_visits(steps, estimate, landmarks)
+    scan_log.displacements = displacements(steps, estimate, landmarks)
     return estimate, steps
 
 
@@ -281,11 +281,11 @@ def _laid_on_walls(
         if not left:
             break
         landmarks.update_from(tied, rough.estimate)
-        displaced = displaced_visits(tied, rough.estimate, landmarks)
-        if not displaced:
+        found = displacements(tied, rough.estimate, landmarks)
+        by = {name: one.by for name, one in found.items() if one.is_clear}
+        if not by:
             break
-        scan_log.counts["visits_displaced"] += len(displaced)
-        by = {name: found.by for name, found in displaced.items()}
+        scan_log.counts["visits_displaced"] += len(by)
         paths = paths.displaced(rough.estimate.states, by)
         steps = _with_displaced_starts(steps, by, scan_log)
         landmarks.return_to(untied)

@@ -121,8 +121,8 @@ class Evidence:
 
     ``without_odometry``: robots whose motion is that of their scans. ``observed``: whether an
     observation or a closure is in the estimate. ``closures``: how well these fit; None without.
-    ``told``: the starts that the user gave. ``displaced``: visits whose walls of the building stand
-    beside those that were seen before.
+    ``told``: the starts that the user gave. ``displacements`` of visits from
+    where walls of the building were seen before.
     """
 
     robots: tuple[RobotEvidence, ...]
@@ -132,7 +132,7 @@ class Evidence:
     observed: bool = True
     closures: ClosureMisfits | None = None
     told: tuple[ToldStart, ...] = ()
-    displaced: Mapping[str, Displacement] = field(default_factory=dict)
+    displacements: Mapping[str, Displacement] = field(default_factory=dict)
 
     @property
     def begin_ns(self) -> int:
@@ -190,7 +190,7 @@ def gather(
     told = told_starts(pipeline, steps, estimate)
     return Evidence(
         tuple(found), summary, innovations, by_scans_alone, observed, misfits, told,
-        pipeline.displaced,
+        pipeline.displacements,
     )  # fmt: skip
 
 

@@ -217,13 +217,14 @@ def _sessions(evidence: Evidence) -> Iterable[Reason]:
 
 def _doubled_walls(evidence: Evidence) -> Iterable[Reason]:
     """Walls of the building do not move, but all of the furniture may be pushed alike."""
-    for name, found in evidence.displaced.items():
-        text = (
-            f"{name}: walls of the building appear twice over {found.twice_m:.0f} m, displaced "
-            f"alike by {math.hypot(*found.by):.2f} m from where they were before: furniture that "
-            "was pushed alike is taken for what stayed"
-        )
-        yield Reason("doubtful", "doubled walls", name, text)
+    for name, found in evidence.displacements.items():
+        if found.is_doubtful:
+            text = (
+                f"{name}: walls of the building appear twice over {found.twice_m:.0f} m, displaced "
+                f"alike by {math.hypot(*found.by):.2f} m: much was pushed alike, and is taken for "
+                "what stayed"
+            )
+            yield Reason("doubtful", "doubled walls", name, text)
 
 
 def _known_map(evidence: Evidence) -> Iterable[Reason]:
