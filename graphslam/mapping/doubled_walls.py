@@ -51,6 +51,12 @@ class Pieces(NamedTuple):
     direction: Array
     length: Array
 
+    @property
+    def ends(self) -> Array:
+        """Both ends of each (n, 2, 2), m."""
+        half = 0.5 * self.length[:, None] * unit_vectors(self.direction)
+        return np.stack([self.at - half, self.at + half], axis=1)
+
 
 class Displacement(NamedTuple):
     """What lays the walls of a visit on those seen before, ``by`` (2,) m in the world.
@@ -110,7 +116,8 @@ def compare(own: Pieces, before: Pieces) -> Displacement | None:
     if not len(which):
         return None
     first = np.flatnonzero(np.diff(which, prepend=-1))
-    at, length = own.at[which[first]], own.length[which[first]]
+    beside = Pieces(*(column[which[first]] for column in own))
+    length = beside.length
 
     def on(by: Array) -> Array:
         """Which pieces (m,) lie on one that was seen before, displaced by (2,)."""
@@ -124,11 +131,16 @@ def compare(own: Pieces, before: Pieces) -> Displacement | None:
         by = by + np.linalg.lstsq(weighted.T @ normal, weighted.T @ left, rcond=1e-3)[0]
     here, there = on(np.zeros(2)), on(by)
     twice = there & ~here
-    wide_m = 0.0
-    if twice.any():
-        centred = at[twice] - at[twice].mean(axis=0)
-        wide_m = float(np.ptp(centred @ np.linalg.svd(centred, full_matrices=True)[2][1]))
+    wide_m = _width(beside.ends[twice].reshape(-1, 2))
     return Displacement(by, float(length[twice].sum()), float(length[here & ~there].sum()), wide_m)
+
+
+def _width(points: Array) -> float:
+    """How wide points (n, 2) extend, m, across the direction in which they extend farthest."""
+    if not len(points):
+        return 0.0
+    axes = np.linalg.eigh(np.cov(points.T))[1]
+    return float(np.ptp(points @ axes[:, 0]))
 
 
 def _best(normal: Array, off: Array, first: IntArray, length: Array) -> Array:
