@@ -12,13 +12,14 @@ There is one for all of a visit: closures in a room that contradict those in oth
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from graphslam.core.arrays import IntArray
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.geometry import Array, unit_vectors
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.mapping.building import of_building
@@ -36,9 +37,9 @@ LEAST_M = 0.04
 #: m: of walls that stand twice, at least, and how wide an area they enclose: one wall alone may be
 #: seen from both of its sides
 LEAST_TWICE_M, LEAST_WIDE_M = 3.0, 1.0
-#: how many times the length that lies on others only as it is must do so only if displaced: for a
-#: doubt, and for a displacement. In the simulated office on five days and in Intel's thirds no piece
-#: lies on others only if displaced; where all furniture of the lab was pushed alike nearly all do
+#: how many times as long as what lies on others only as it is must be what does so only if
+#: displaced: for a doubt, and for a displacement. In the simulated office on five days and in
+#: Intel's thirds nothing does; where all furniture of the lab was pushed alike nearly all
 DOUBT_FACTOR, CLEAR_FACTOR = 0.5, 4.0
 #: in place of a visit's name, of what an earlier map knows
 _BEFORE = ""
@@ -102,11 +103,12 @@ def displacements(
     (_, before), *visits = _building(steps, estimate, landmarks)
     for visit, own in visits:
         displacement = compare(own, before)
+        placed = own
         if displacement is not None:
             found[visit] = displacement
             if displacement.is_clear:
-                own = own._replace(at=own.at + displacement.by)
-        before = Pieces(*map(np.concatenate, zip(before, own, strict=True)))
+                placed = own._replace(at=own.at + displacement.by)
+        before = Pieces(*map(np.concatenate, zip(before, placed, strict=True)))
     return found
 
 
@@ -119,10 +121,10 @@ def compare(own: Pieces, before: Pieces) -> Displacement | None:
     beside = Pieces(*(column[which[first]] for column in own))
     length = beside.length
 
-    def on(by: Array) -> Array:
+    def on(by: Array) -> BoolArray:
         """Which pieces (m,) lie on one that was seen before, displaced by (2,)."""
         near = np.abs(off - normal @ by) < ON_M
-        return np.asarray(np.logical_or.reduceat(near, first))
+        return np.asarray(np.logical_or.reduceat(near, first), dtype=np.bool_)
 
     by = _best(normal, off, first, length)
     for _ in range(ROUNDS):
@@ -195,7 +197,8 @@ def _building(
         if stay:
             for visit, piece in _seen_pieces(every, estimate, estimate.landmarks[number][0]):
                 found[visit].append(piece)
-    visits = sorted(estimate.states, key=lambda name: (int(estimate.states[name].stamps_ns[0]), name))
+    first = {name: int(states.stamps_ns[0]) for name, states in estimate.states.items()}
+    visits = sorted(first, key=lambda name: (first[name], name))
     return [(name, _pieces(found[name])) for name in (_BEFORE, *visits)]
 
 
@@ -209,11 +212,11 @@ def _pieces(found: Sequence[tuple[Array, float, float]]) -> Pieces:
 
 def _known_pieces(wall: Entry) -> Iterator[tuple[Array, float, float]]:
     """A wall of an earlier map in pieces: middle, direction, length."""
-    count = max(1, int(np.ceil(np.ptp(wall.extent) / PIECE_M)))
-    ends = np.linspace(*wall.extent, count + 1)
-    for low, high in zip(ends[:-1], ends[1:], strict=True):
+    first, last = wall.extent.tolist()
+    ends = np.linspace(first, last, 1 + max(1, int(np.ceil((last - first) / PIECE_M))))
+    for low, high in pairwise(ends.tolist()):
         middle = wall.mean[:2] + 0.5 * (low + high) * unit_vectors(wall.mean[2])
-        yield middle, float(wall.mean[2]), float(high - low)
+        yield middle, float(wall.mean[2]), high - low
 
 
 def _seen_pieces(

@@ -48,8 +48,8 @@ def room(by, visits=("a", "b"), walls=WALLS):
 
 @pytest.mark.parametrize("by", [(0.1, 0.0), (0.2, -0.15), (0.0, 0.4)])
 def test_walls_that_stand_twice_say_by_how_much(by):
-    """Nothing else contradicts a session whose things lie on things that were pushed. A displacement
-    along a wall leaves that where it is."""
+    """Nothing else contradicts a session whose things lie on things that were pushed. Displaced
+    along a wall that stays where it is."""
     (found,) = displacements(*room(by)).values()
     assert found.is_clear and found.is_doubtful
     # twelve observations of 1 cm for each piece of a wall
@@ -66,7 +66,7 @@ def test_walls_that_stand_once_are_left():
 
 
 def test_visits_are_compared_where_the_ones_before_belong():
-    """Two days after the furniture was pushed are off alike: neither lies on the first one's walls."""
+    """Two days after the furniture was pushed are off alike, and lie on each other's walls."""
     found = displacements(*room((0.2, 0.1), visits=("a", "b", "c")))
     assert found.keys() == {"b", "c"}
     assert all(one.is_clear for one in found.values())
@@ -93,17 +93,15 @@ HALF = np.pi / 2
 
 def test_one_wall_seen_from_both_sides_is_no_displacement():
     """A partition is 10 cm thick: who drove on the other side of it sees another face."""
-    found = compare(
-        pieces((2, 0.1, 0, 4), (6, 0.1, 0, 4)), pieces((2, 0, 0, 4), (6, 0, 0, 4))
-    )
+    found = compare(pieces((2, 0.1, 0, 4), (6, 0.1, 0, 4)), pieces((2, 0, 0, 4), (6, 0, 0, 4)))
     assert found.twice_m == 8.0
     assert not found.is_clear and not found.is_doubtful
 
 
 @pytest.mark.parametrize(("staying", "doubt"), [(0, True), (1, True), (10, False)])
 def test_what_stays_in_part_is_a_doubt_and_no_displacement(staying, doubt):
-    """A row of cupboards as long as walls was pushed, or walls stand twice: nobody can tell. That in
-    a whole building something long was moved is no doubt."""
+    """A row of cupboards as long as walls was pushed, or walls stand twice: nobody can tell. That
+    something long was moved in a whole building is no doubt."""
     before = [(2, 0, 0, 4), (2, 6, 0, 4), (6, 3, HALF, 4), (-2, 3, HALF, 4)]
     own = [(2, 0.2, 0, 4), (2, 6.2, 0, 4), *before[2:]]  # along the other two
     stay = [(2 + 4 * k, 20, 0, 4) for k in range(staying)]

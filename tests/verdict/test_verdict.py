@@ -472,9 +472,11 @@ def test_counts_of_the_run_are_judged(change, level, text):
     assert verdict == level and text in told
 
 
-@pytest.mark.parametrize(("once_m", "level"), [(0.0, "doubtful"), (9.0, "doubtful"), (90.0, "good")])
+@pytest.mark.parametrize(
+    ("once_m", "level"), [(0.0, "doubtful"), (9.0, "doubtful"), (90.0, "good")]
+)
 def test_walls_of_the_building_that_stand_twice_are_said(once_m, level):
-    """All furniture was pushed by 25 cm, and the second day lay off by that, with a good verdict."""
+    """All furniture was pushed by 25 cm: the second day lay off by that, with a good verdict."""
     found = {"day1": Displacement(np.array([0.2, 0.15]), 13.0, once_m, 8.0)}
     verdict, told = reasons(replace(evidence(), displacements=found))
     assert verdict == level
