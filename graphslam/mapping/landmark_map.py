@@ -237,6 +237,16 @@ class LandmarkMap:
                     entry.extend(self.known[number].mean, self.known[number].extent)
         self.drop_index()
 
+    def copies(self) -> dict[int, Entry]:
+        """All landmarks as they are now, for `return_to`."""
+        return {n: entry.copied(n) for n, entry in self.entries.items()}
+
+    def return_to(self, entries: Mapping[int, Entry]) -> None:
+        """Have landmarks as they were, and no others."""
+        self.entries = {n: entry.copied(n) for n, entry in entries.items()}
+        self._tentative = {n: e for n, e in self.entries.items() if not e.in_graph}
+        self.drop_index()
+
     def split(self, number: int, new: int) -> None:
         """Add landmark ``new`` as a copy of ``number``, without its identity."""
         self.entries[new] = replace(self.entries[number].copied(new), identity=None)

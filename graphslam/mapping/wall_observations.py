@@ -45,10 +45,15 @@ class WallObservations:
         )  # fmt: skip
 
     @property
+    def seen_from_to(self) -> tuple[float, float]:
+        """What they show by their ends, but for a few: from and to along the wall, m."""
+        return float(np.quantile(self.ends[:, 0], 0.2)), float(np.quantile(self.ends[:, 1], 0.8))
+
+    @property
     def length(self) -> float:
         """Length, m, of what they show by their ends, but for a few."""
-        low, high = np.quantile(self.ends[:, 0], 0.2), np.quantile(self.ends[:, 1], 0.8)
-        return float(high - low)
+        low, high = self.seen_from_to
+        return high - low
 
     def normal_equations(self) -> tuple[Array, Array]:
         """Of the line, by how far across and in what direction it is at 0: (n, 2, 2), (n, 2)."""

@@ -14,6 +14,7 @@ from graphslam.core.records import Association, KeyframeScan, Sighting, Start, S
 from graphslam.core.suggestions import start_option
 from graphslam.logs import LogSet
 from graphslam.logs.clock import Clock
+from graphslam.mapping.doubled_walls import Displacement
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.landmark_map import LandmarkMap
 from graphslam.multi_robot.frame_tree import FrameAssignment
@@ -90,6 +91,8 @@ class LogPass:
         self.scan_evidence: Mapping[str, ScanEvidence] = {}
         #: landmarks that were moved: number -> the landmark that they were before
         self.moved: Mapping[int, int] = {}
+        #: of visits, from where their walls of the building were seen before
+        self.displacements: Mapping[str, Displacement] = {}
         self.counts: Counter[str] = Counter()
         self.skipped_before: Mapping[str, int] = {}  # by the run that this one goes on with
         self.dropped: Counter[str] = Counter()

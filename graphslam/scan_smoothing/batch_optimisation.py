@@ -13,9 +13,10 @@ import numpy as np
 
 from graphslam.core.allocation import give_back_freed_memory
 from graphslam.core.config import Config
+from graphslam.core.geometry import Array
 from graphslam.core.motion_models import Calibration
 from graphslam.core.record import replace
-from graphslam.core.records import Closure, Estimate, Step
+from graphslam.core.records import Closure, Estimate, Start, Step
 from graphslam.core.worker import Future
 from graphslam.estimation.batch_calibration import recompute_motions
 from graphslam.estimation.calibration_graph import (
@@ -36,6 +37,7 @@ from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.posterior_residuals import Posterior
 from graphslam.estimation.settled import moved_to, settled
 from graphslam.mapping.composite_walls import split_composites
+from graphslam.mapping.doubled_walls import displacements
 from graphslam.mapping.duplicate_landmarks import (
     find_duplicates,
     merged,
@@ -65,6 +67,8 @@ NOISE_ROUNDS = 2
 NOISE_STATES = 800
 #: times that things that were pushed alike are looked for: between more visits pushed again
 PUSHED_ROUNDS = 3
+#: times that visits are displaced: those after a displaced one may be as well
+DISPLACED_ROUNDS = 2
 #: peak memory from which on what closing loops has freed is half of what a process holds
 LARGE_MB = 400.0
 
@@ -92,17 +96,19 @@ def optimise_scan_log(
     counts["closures_across"] = len(paths.closures) - fixing
     counts["closures_refused"] += paths.refused
     with timed(seconds, "final"):
-        marks = mean_landmarks(steps, paths.states)
-        known_map = scan_log.known.known_map
-        if known_map is not None:
+        if scan_log.known.known_map is not None:
             counts["closures_to_map"] = paths.to_map
-            marks |= {
-                n: (m, np.full((len(m),) * 2, np.nan)) for n, m in known_map.known.means.items()
-            }
-        start = Estimate(paths.states, marks, 0.0, 0)
-        estimate, steps = _solved(steps, start, paths, scan_log, tracks)
+        estimate, steps = _solved(steps, paths, scan_log, tracks)
     scan_log.steps = list(steps)
     return estimate
+
+
+def _start(steps: Sequence[Step], paths: ClosedPaths, scan_log: TrackedLog) -> Estimate:
+    """Where landmarks are by what is seen from the paths, or by an earlier map."""
+    marks, known_map = mean_landmarks(steps, paths.states), scan_log.known.known_map
+    if known_map is not None:
+        marks |= {n: (m, np.full((len(m),) * 2, np.nan)) for n, m in known_map.known.means.items()}
+    return Estimate(paths.states, marks, 0.0, 0)
 
 
 class _Problem:
@@ -193,17 +199,15 @@ def _motion_noise(
 
 def _solved(
     steps: tuple[Step, ...],
-    start: Estimate,
     paths: ClosedPaths,
     scan_log: TrackedLog,
     tracks: Mapping[str, Track],
 ) -> tuple[Estimate, tuple[Step, ...]]:
     """All states, landmarks and the calibration, solved with landmarks tied and reassociated."""
     config, counts, landmarks = scan_log.config, scan_log.counts, scan_log.landmarks
+    steps, rough, paths = _laid_on_walls(steps, paths, scan_log, tracks)
     closures = list(paths.closures)
-    steps = _tied(steps, start, None, paths, scan_log)
     closed = with_closures(steps, closures)
-    rough = _Problem(closed, start, tracks, config).solve_roughly()
     # all that follows needs nothing but this solution; the second process looks for the noise
     asked = (
         Future(lambda: _motion_noise(closed, rough.estimate, tracks, config))
@@ -250,7 +254,61 @@ def _solved(
         estimate = moved_to(minimum.result(), estimate)
     # the minimum may have turned the map as a whole: ends of walls are where they are seen there
     landmarks.update_from(steps, estimate)
+    scan_log.displacements = displacements(steps, estimate, landmarks)
     return estimate, steps
+
+
+def _laid_on_walls(
+    steps: tuple[Step, ...],
+    paths: ClosedPaths,
+    scan_log: TrackedLog,
+    tracks: Mapping[str, Track],
+) -> tuple[tuple[Step, ...], CalibratedSolution, ClosedPaths]:
+    """Steps with landmarks tied, and their rough solution, in which walls of all visits are one.
+
+    Visits whose walls of the building stand beside those that were seen before are displaced, and
+    all is tied again, without the closures that laid them there. The paths are those that were
+    solved.
+    """
+    landmarks = scan_log.landmarks
+    untied = landmarks.copies()
+    is_compared = bool(landmarks.known) or len(paths.states) > 1
+    for left in reversed(range(1 + DISPLACED_ROUNDS * is_compared)):
+        start = _start(steps, paths, scan_log)
+        tied = _tied(steps, start, None, paths, scan_log)
+        closed = with_closures(tied, paths.closures)
+        rough = _Problem(closed, start, tracks, scan_log.config).solve_roughly()
+        if not left:
+            break
+        landmarks.update_from(tied, rough.estimate)
+        found = displacements(tied, rough.estimate, landmarks)
+        by = {name: one.by for name, one in found.items() if one.is_clear}
+        if not by:
+            break
+        scan_log.counts["visits_displaced"] += len(by)
+        paths = paths.displaced(rough.estimate.states, by)
+        steps = _with_displaced_starts(steps, by, scan_log)
+        landmarks.return_to(untied)
+    return tied, rough, paths
+
+
+def _with_displaced_starts(
+    steps: Sequence[Step], by: Mapping[str, Array], scan_log: TrackedLog
+) -> tuple[Step, ...]:
+    """Steps in which starts that were found, not told, are displaced ``by`` (2,) m as well."""
+    told = scan_log.given_config.start
+    if scan_log.known.known_map is None:  # there what was told is only a hint
+        by = {} if told.from_truth else {n: off for n, off in by.items() if n not in told.poses}
+
+    def at(name: str, start: Start) -> Start:
+        return replace(start, pose=start.pose + np.append(by[name], 0.0)) if name in by else start
+
+    return tuple(
+        replace(step, starts={name: at(name, start) for name, start in step.starts.items()})
+        if step.starts
+        else step
+        for step in steps
+    )
 
 
 def _without_pushed(

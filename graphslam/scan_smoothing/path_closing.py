@@ -8,6 +8,7 @@ import numpy as np
 from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, exp, log, path_length, rotate_cov
 from graphslam.core.records import Closure, Step, Trajectory
+from graphslam.mapping.doubled_walls import ON_M
 from graphslam.mapping.known_map import MAP_ROBOT, KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.redundant_closures import Span
@@ -56,6 +57,21 @@ class ClosedPaths:
         first = self.first[robot]
         cov = self.graph.covariance(np.array([first]))
         return np.asarray(rotate_cov(cov, float(self.graph.poses[first, 2])))
+
+    def displaced(self, states: Mapping[str, Trajectory], by: Mapping[str, Array]) -> "ClosedPaths":
+        """Paths of which some are displaced ``by`` (2,) m, and the closures that agree with that.
+
+        ``states`` (robot -> poses) are from where. The graph keeps what it knew of the paths.
+        """
+        moved = dict(states)
+        for name, off in by.items():
+            moved[name] = replace(states[name], poses=states[name].poses + np.append(off, 0.0))
+        stays = np.zeros(2)
+        kept = [
+            c for c in self.closures
+            if np.hypot(*(by.get(c.robot, stays) - by.get(c.other, stays))) < ON_M
+        ]  # fmt: skip
+        return replace(self, states=moved, closures=kept)
 
     def uncertainty(self, steps: Sequence[Step]) -> "LandmarkUncertainty":
         """How well the relative position of landmarks is known that ``steps`` have."""

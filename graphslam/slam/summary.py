@@ -35,6 +35,7 @@ REOPTIMISED = (
     "closures_kept",
     "landmarks_merged",
     "landmarks_moved",
+    "visits_displaced",
     "observations_reassociated",
     "observations_dropped",
     "observations_by_loose_returns",

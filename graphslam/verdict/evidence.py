@@ -16,6 +16,7 @@ from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, RobotResult, Step
+from graphslam.mapping.doubled_walls import Displacement
 from graphslam.odometry.missing_increments import MissingIncrements
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.pipeline.path_evidence import NO_PATH, PathMisfits
@@ -120,7 +121,8 @@ class Evidence:
 
     ``without_odometry``: robots whose motion is that of their scans. ``observed``: whether an
     observation or a closure is in the estimate. ``closures``: how well these fit; None without.
-    ``told``: the starts that the user gave.
+    ``told``: the starts that the user gave. ``displacements`` of visits from
+    where walls of the building were seen before.
     """
 
     robots: tuple[RobotEvidence, ...]
@@ -130,6 +132,7 @@ class Evidence:
     observed: bool = True
     closures: ClosureMisfits | None = None
     told: tuple[ToldStart, ...] = ()
+    displacements: Mapping[str, Displacement] = field(default_factory=dict)
 
     @property
     def begin_ns(self) -> int:
@@ -185,7 +188,10 @@ def gather(
     by_scans_alone = tuple(pipeline.log.without_odometry)
     misfits = _closure_misfits(steps, estimate)
     told = told_starts(pipeline, steps, estimate)
-    return Evidence(tuple(found), summary, innovations, by_scans_alone, observed, misfits, told)
+    return Evidence(
+        tuple(found), summary, innovations, by_scans_alone, observed, misfits, told,
+        pipeline.displacements,
+    )  # fmt: skip
 
 
 def _closure_misfits(steps: Sequence[Step], estimate: Estimate) -> ClosureMisfits | None:

@@ -215,6 +215,18 @@ def _sessions(evidence: Evidence) -> Iterable[Reason]:
         yield Reason("doubtful", "sessions", name, f"{name}: {said}")
 
 
+def _doubled_walls(evidence: Evidence) -> Iterable[Reason]:
+    """Walls of the building do not move, but all of the furniture may be pushed alike."""
+    for name, found in evidence.displacements.items():
+        if found.is_doubtful:
+            text = (
+                f"{name}: walls of the building appear twice over {found.twice_m:.0f} m, displaced "
+                f"alike by {math.hypot(*found.by):.2f} m: much was pushed alike, and is taken for "
+                "what stayed"
+            )
+            yield Reason("doubtful", "doubled walls", name, text)
+
+
 def _known_map(evidence: Evidence) -> Iterable[Reason]:
     """A place in a known map of which much speaks against it."""
     known = evidence.summary.get("known_map", {})
@@ -249,6 +261,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "unplaced": _unplaced,
     "starts": _starts,
     "sessions": _sessions,
+    "doubled walls": _doubled_walls,
     "known map": _known_map,
     "observations": _unobserved,
 }

@@ -10,6 +10,7 @@ from command_line import call
 from graphslam.core.geometry import between, compose, polar_points, transform_each
 from graphslam.logs import LogWriter
 from graphslam.logs.time_order import TOO_LATE
+from graphslam.mapping.doubled_walls import Displacement
 from graphslam.pipeline.path_evidence import FACTORS, PathMisfits
 from graphslam.pipeline.scan_evidence import Parked, _half_changed
 from graphslam.verdict.evidence import ClosureMisfits, Evidence, RobotEvidence, Seen
@@ -469,6 +470,18 @@ def test_what_is_wrong_is_said_as_what_it_is(name):
 def test_counts_of_the_run_are_judged(change, level, text):
     verdict, told = reasons(replace(evidence(), summary=SUMMARY | change))
     assert verdict == level and text in told
+
+
+@pytest.mark.parametrize(
+    ("once_m", "level"), [(0.0, "doubtful"), (9.0, "doubtful"), (90.0, "good")]
+)
+def test_walls_of_the_building_that_stand_twice_are_said(once_m, level):
+    """All furniture was pushed by 25 cm: the second day lay off by that, with a good verdict."""
+    found = {"day1": Displacement(np.array([0.2, 0.15]), 13.0, once_m, 8.0)}
+    verdict, told = reasons(replace(evidence(), displacements=found))
+    assert verdict == level
+    said = "day1: walls of the building appear twice over 13 m, displaced alike by 0.25 m"
+    assert (said in told) is (level != "good")
 
 
 @pytest.mark.parametrize(

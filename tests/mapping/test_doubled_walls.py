@@ -1,0 +1,116 @@
+"""Walls of the building that stand twice, displaced alike, are told from those that stand once."""
+
+import numpy as np
+import pytest
+
+from graphslam.core.geometry import between, compose, rotation3
+from graphslam.core.record import replace
+from graphslam.core.records import Association, Estimate, Step, Trajectory
+from graphslam.mapping.doubled_walls import Pieces, compare, displacements
+from graphslam.mapping.landmark_map import Entry, LandmarkMap
+
+SIGMAS = np.array([0.3, 0.01, 0.005])
+#: middle and direction of each wall, and half of its length, m: a room, and things in it
+WALLS = [((5, 0, 0), 4.0), ((10, 4, 1.57), 3.5), ((5, 8, 3.14), 4.0), ((0, 4, -1.57), 3.5)]
+THINGS = [((4, 4, 1.57), 0.5), ((6, 4, -1.57), 0.5), ((5, 3.5, 0), 0.8)]
+PER_VISIT = 12
+
+
+def room(by, visits=("a", "b"), walls=WALLS):
+    """Visits of a room, of which all but the first lie ``by`` (2,) off: each has walls of its own,
+    and the things are one, as they were pushed by as much."""
+    rng = np.random.default_rng(0)
+    states, steps, marks, landmarks = {}, [], {}, LandmarkMap(bias_m=0.01)
+    for v, name in enumerate(visits):
+        off = np.array([*by, 0.0]) * (v > 0)
+        stamps = 1000 * v + np.arange(PER_VISIT, dtype=np.int64)
+        angle = np.linspace(0, 2 * np.pi, PER_VISIT)
+        poses = np.column_stack([5 + np.cos(angle), 4 + np.sin(angle), angle]) + off
+        states[name] = Trajectory(stamps, poses, np.zeros((PER_VISIT, 3, 3)))
+        seen = [(100 * v + k, np.array(w, float) + off, h) for k, (w, h) in enumerate(walls)]
+        seen += [(50 + k, np.array(w, float), h) for k, (w, h) in enumerate(THINGS)]
+        for number, at, half in seen:
+            extent = np.array([-half, half])
+            marks[number] = at, np.eye(3)
+            entry = Entry(number, "line", at.copy(), np.eye(3), extent, 0, 9, None, 9, True)
+            landmarks.add_all({number: entry})
+        for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+            made = []
+            for number, at, half in seen:
+                own = compose(at, SIGMAS * rng.normal(size=3) * (0, 1, 1))
+                z = between(pose, own)
+                turn = rotation3(np.array([z[2]]))[0]
+                cov, extent = turn @ np.diag(SIGMAS**2) @ turn.T, np.array([-half, half])
+                made.append(Association(name, stamp, number, "line", z, cov, extent=extent))
+            steps.append(Step(stamp, {}, {}, tuple(made)))
+    return tuple(steps), Estimate(states, marks, 0.0, 1), landmarks
+
+
+@pytest.mark.parametrize("by", [(0.1, 0.0), (0.2, -0.15), (0.0, 0.4)])
+def test_walls_that_stand_twice_say_by_how_much(by):
+    """Nothing else contradicts a session whose things lie on things that were pushed. Displaced
+    along a wall that stays where it is."""
+    (found,) = displacements(*room(by)).values()
+    assert found.is_clear and found.is_doubtful
+    # twelve observations of 1 cm for each piece of a wall
+    assert found.by == pytest.approx(-np.array(by), abs=0.01)
+    # two walls of 7 m or 8 m are across any of these, and a bit of each piece is not seen
+    assert found.twice_m > 11.0 and found.once_m == 0.0
+
+
+def test_walls_that_stand_once_are_left():
+    """Also a few millimetres off, as sessions are: a false one would tear what was tied."""
+    for by in ((0.0, 0.0), (0.015, -0.01)):
+        (found,) = displacements(*room(by)).values()
+        assert not found.is_clear and not found.is_doubtful
+
+
+def test_visits_are_compared_where_the_ones_before_belong():
+    """Two days after the furniture was pushed are off alike, and lie on each other's walls."""
+    found = displacements(*room((0.2, 0.1), visits=("a", "b", "c")))
+    assert found.keys() == {"b", "c"}
+    assert all(one.is_clear for one in found.values())
+    assert found["c"].by == pytest.approx((-0.2, -0.1), abs=0.01)
+
+
+def test_an_earlier_map_is_a_visit_and_one_visit_alone_is_none():
+    steps, estimate, landmarks = room((0.2, 0.1))
+    day = replace(estimate, states={"b": estimate.states["b"]})
+    assert not displacements(steps[PER_VISIT:], day, landmarks)
+    landmarks.add_known({n: landmarks.entries[n].copied(n) for n in range(len(WALLS))})
+    (found,) = displacements(steps[PER_VISIT:], day, landmarks).values()
+    assert found.is_clear and found.by == pytest.approx((-0.2, -0.1), abs=0.01)
+
+
+def pieces(*walls):
+    """Of middles x, y, directions and lengths."""
+    table = np.array(walls, float).reshape(-1, 4)
+    return Pieces(table[:, :2], table[:, 2], table[:, 3])
+
+
+HALF = np.pi / 2
+
+
+def test_one_wall_seen_from_both_sides_is_no_displacement():
+    """A partition is 10 cm thick: who drove on the other side of it sees another face."""
+    found = compare(pieces((2, 0.1, 0, 4), (6, 0.1, 0, 4)), pieces((2, 0, 0, 4), (6, 0, 0, 4)))
+    assert found.twice_m == 8.0
+    assert not found.is_clear and not found.is_doubtful
+
+
+@pytest.mark.parametrize(("staying", "doubt"), [(0, True), (1, True), (10, False)])
+def test_what_stays_in_part_is_a_doubt_and_no_displacement(staying, doubt):
+    """A row of cupboards as long as walls was pushed, or walls stand twice: nobody can tell. That
+    something long was moved in a whole building is no doubt."""
+    before = [(2, 0, 0, 4), (2, 6, 0, 4), (6, 3, HALF, 4), (-2, 3, HALF, 4)]
+    own = [(2, 0.2, 0, 4), (2, 6.2, 0, 4), *before[2:]]  # along the other two
+    stay = [(2 + 4 * k, 20, 0, 4) for k in range(staying)]
+    found = compare(pieces(*own, *stay), pieces(*before, *stay))
+    assert found.is_doubtful is doubt
+    assert found.is_clear is (staying == 0)
+
+
+def test_what_is_nowhere_near_is_not_compared():
+    assert compare(pieces((2, 0, 0, 4)), pieces((2, 5, 0, 4))) is None
+    assert compare(pieces((2, 0, 0, 4)), pieces()) is None
+    assert compare(pieces(), pieces((2, 0, 0, 4))) is None
