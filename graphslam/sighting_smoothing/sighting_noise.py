@@ -43,8 +43,8 @@ MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
 #: where odometry is taken for less noisy than it is, errors seem to be shared: this is looked at
 #: again if its variance changes by a larger share
 UNSETTLED_SHARE = 1.0
-#: relative decrease of the error at which optimisation ends
-CONVERGED_ERROR = 1e-4
+#: relative decrease of the error at which optimisation ends: variances are known to some per cent
+CONVERGED_ERROR = 5e-4
 #: smallest factor on a stated variance on the way, for logs without noise
 MIN_VARIANCE = 1e-4
 #: rad: a bearing that is stated to be less certain was not measured
