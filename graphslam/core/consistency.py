@@ -140,7 +140,7 @@ def generalised_least_squares(
 
 
 def rival_set(
-    agree: Array,
+    agree: NDArray[Any],
     worth: Array | NDArray[np.float32],
     rest: IntArray,
     starts: int | None = None,

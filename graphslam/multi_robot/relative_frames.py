@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from graphslam.core.arrays import IntArray
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import Config
 from graphslam.core.consistency import (
     FIT_PROBABILITY,
@@ -114,22 +114,19 @@ class CorrespondenceSide:
     times_ns: IntArray
     range_m: Array
 
-    def relative_variance(self, estimate: RobotEstimate) -> Array:
-        """Variances (n, n) m² of points relative to each other, by the estimate or by odometry.
+    def relative_variance(self, estimate: RobotEstimate, i: IntArray, j: IntArray) -> Array:
+        """Variances (k,) m² of points j (k,) relative to i (k,), by the estimate or by odometry.
 
         Estimates of nearby times share most of their error, which a sum of marginals ignores:
         odometry between the two times may bound it better, so the smaller one is taken.
         """
-        variance = self.variance[:, None] + self.variance
-        timed = np.flatnonzero(self.times_ns != UNTIMED)
+        variance = self.variance[i] + self.variance[j]
+        timed = np.flatnonzero((self.times_ns[i] != UNTIMED) & (self.times_ns[j] != UNTIMED))
         if len(timed):
-            timed = timed[np.argsort(self.times_ns[timed], kind="stable")]
-            i, j = (timed[k] for k in np.triu_indices(len(timed), 1))
-            moved = estimate.motions(self.times_ns[i], self.times_ns[j])
-            back = inverse_cov(moved.delta, moved.cov)
-            for to, seen_from, cov in ((j, i, moved.cov), (i, j, back)):
-                odometry = cov[:, 0, 0] + cov[:, 1, 1] + self.range_m[to] ** 2 * cov[:, 2, 2]
-                variance[seen_from, to] = np.minimum(variance[seen_from, to], odometry)
+            seen_from, to = i[timed], j[timed]
+            cov = estimate.motions(self.times_ns[seen_from], self.times_ns[to]).cov
+            odometry = cov[:, 0, 0] + cov[:, 1, 1] + self.range_m[to] ** 2 * cov[:, 2, 2]
+            variance[timed] = np.minimum(variance[timed], odometry)
         return variance
 
 
@@ -175,12 +172,7 @@ def estimate_relative_frame(
     if weight.sum() < MIN_EVIDENCE:
         return ""
     p, q = sides
-    distance = [np.linalg.norm(e.points[:, None] - e.points, axis=-1) for e in sides]
-    spread = noise[:, None] + noise
-    for side, name in zip(sides, (a, b), strict=True):
-        spread = spread + side.relative_variance(estimates[name])
-    agree = (distance[0] - distance[1]) ** 2 <= chi2_quantile(AGREE, 1) * spread
-    np.fill_diagonal(agree, False)
+    agree = _agree(sides, (estimates[a], estimates[b]), noise)
     variance = p.variance + q.variance + noise
     best = _remove_outliers(greedy_max_clique(agree, weight), p.points, q.points, variance)
     if weight[best].sum() < MIN_EVIDENCE:
@@ -212,6 +204,29 @@ def estimate_relative_frame(
     cov = cov + np.diag([floor[0], floor[0], floor[1]])
     cov += _drift_covariance(pose, estimates[a], estimates[b], p, q, best)
     return RelativeFrame(b, a, pose, cov, float(weight[best].sum()))
+
+
+def _agree(
+    sides: tuple[CorrespondenceSide, CorrespondenceSide],
+    estimates: tuple[RobotEstimate, RobotEstimate],
+    noise: Array,
+) -> BoolArray:
+    """Which of n correspondences are as far apart on either side (n, n), but for errors.
+
+    ``noise`` (n,) m²: of each by itself. How well robots know the distances matters to few pairs:
+    it is at most what marginals say, and most agree, or not, whatever it is.
+    """
+    distance = [np.linalg.norm(e.points[:, None] - e.points, axis=-1) for e in sides]
+    off = (distance[0] - distance[1]) ** 2 / chi2_quantile(AGREE, 1)
+    least, both = noise[:, None] + noise, sides[0].variance + sides[1].variance
+    agree = np.asarray(off <= least)
+    i, j = np.nonzero(~agree & (off <= least + both[:, None] + both))
+    spread = least[i, j]
+    for side, estimate in zip(sides, estimates, strict=True):
+        spread = spread + side.relative_variance(estimate, i, j)
+    agree[i, j] = off[i, j] <= spread
+    np.fill_diagonal(agree, False)
+    return agree
 
 
 def _correspondences(
