@@ -14,13 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphslam.core.config import Config
-from graphslam.core.geometry import Array, compose, log, polar_points
-from graphslam.core.observation_models import transport
+from graphslam.core.geometry import Array, log, polar_points, transform_each
 from graphslam.core.records import Association, Estimate, Sighting, Step
 from graphslam.estimation.clock_graph import DRIFT, OFFSET_S, clock_errors, robot_associations
 from graphslam.logs.clock import Clock
 from graphslam.odometry.preintegration import Track
-from graphslam.perception.sightings import sighting_observation
 
 #: an offset is applied if it is so many sigmas and at least so long, s
 SIGNIFICANT_SIGMAS, SIGNIFICANT_S = 4.0, 0.01
@@ -221,13 +219,12 @@ def _relative_offset(
     times = np.array([1e-9 * (s.time_ns - start_ns) for s in seen])
     span = np.floor(times / SPAN_S).astype(int)
     numbers, counts = np.unique(span, return_counts=True)
-    cost, count = np.zeros(len(offsets)), 0
+    points, cost, count = _positions(seen), np.zeros(len(offsets)), 0
     for number in numbers[np.argsort(-counts, kind="stable")][:MAX_SPANS]:
         which = np.flatnonzero(span == number)
         if len(which) < MIN_OBSERVATIONS:
             break
-        points = np.array([[*_position(seen[k]), 0.0] for k in which.tolist()])
-        p = compose(observer.at(times[which]), points)[:, :2] @ np.array([1.0, 1j])
+        p = transform_each(observer.at(times[which]), points[which]) @ np.array([1.0, 1j])
         q = target.at(times[which] + offsets[:, None])[..., :2] @ np.array([1.0, 1j])
         cost += _residual(p, q)
         count += len(which) - 2
@@ -248,13 +245,10 @@ def _relative_offset(
     return ClockOffset(float(offsets[best] + np.clip(shift, -STEP_S, STEP_S)), sigma)
 
 
-def _position(sighting: Sighting) -> Array:
-    """Position (2,) of what was seen, m, in the observer's base frame."""
-    o = sighting_observation(sighting)
-    if len(o.z) == 3:
-        return compose(sighting.mount, o.z)[:2]
-    z, _ = transport(o.z, o.cov, sighting.mount, np.zeros((3, 3)))
-    return polar_points(z[1], z[0])
+def _positions(seen: Sequence[Sighting]) -> Array:
+    """Positions (n, 2) of what was seen, m, in the observer's base frame."""
+    z, mounts = np.array([s.z[:2] for s in seen]), np.array([s.mount for s in seen])
+    return transform_each(mounts, polar_points(z[:, 1], z[:, 0]))
 
 
 def _residual(p: Array, q: Array) -> Array:
