@@ -34,6 +34,7 @@ def with_surface_biases(landmarks: Sequence[Landmark], cov: Array, bias_m: float
 
 def without_days_biases(
     known: KnownLandmarks,
+    itself: KnownLandmarks | None,
     bias_m: float,
     landmarks: Sequence[Landmark],
     cov: Array,
@@ -42,6 +43,7 @@ def without_days_biases(
 
     Args:
         known: what the log was given, with an error of ``bias_m`` across each wall.
+        itself: the same without this error; None: what ``known`` is without it.
         bias_m: sigma, m.
         landmarks: as the log saw them, those of the map that are still there and new ones.
         cov: (D, D) of them, errors of walls along each one's own axes.
@@ -56,10 +58,13 @@ def without_days_biases(
         for first, mark in zip(_first(landmarks), landmarks, strict=True)
         if mark.id in known.means
     ])  # fmt: skip
-    K = known.covariance([mark.id for mark in kept])
-    P = K.copy()
-    across = _across(kept)
-    P[across, across] -= bias_m**2
+    numbers = [mark.id for mark in kept]
+    K = known.covariance(numbers)
+    if itself is None:
+        P, across = K.copy(), _across(kept)
+        P[across, across] -= bias_m**2
+    else:
+        P = itself.covariance(numbers)
     gain = np.linalg.solve(K, P).T
     shift = gain @ np.concatenate([_off(known.means[mark.id], mark) for mark in kept])
     moved = {

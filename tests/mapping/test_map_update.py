@@ -51,7 +51,7 @@ def test_walls_are_averaged_over_days():
     for shifts in days:
         known = known_from(marks, with_surface_biases(marks, cov, BIAS_M))
         seen, after = a_day(known, marks, shifts)
-        marks, cov = without_days_biases(known, BIAS_M, seen, after)
+        marks, cov = without_days_biases(known, None, BIAS_M, seen, after)
     across = [between(WALLS[m.id], m.position)[1] for m in marks]
     # the last days' lines are 1e-3 rad apart at most: the means are along the axes of the first
     np.testing.assert_allclose(across, days.mean(axis=0), atol=0.02 * BIAS_M)
@@ -64,7 +64,7 @@ def test_without_biases_a_day_leaves_what_it_saw():
     marks = [landmark(n, pose) for n, pose in WALLS.items()]
     known = known_from(marks, np.diag([1.0, 1e-2, 1e-4] * 2))
     seen, after = a_day(known, marks, [0.02, -0.01])
-    found, cov = without_days_biases(known, 0.0, seen, after)
+    found, cov = without_days_biases(known, None, 0.0, seen, after)
     np.testing.assert_allclose(cov, after, atol=1e-9)
     for one, other in zip(found, seen, strict=True):
         np.testing.assert_allclose(one.position, other.position, atol=1e-9)
@@ -85,7 +85,7 @@ def test_a_new_landmark_stays_where_the_log_saw_it():
     seen, after = a_day(known, marks, [0.02])
     new = landmark(9, compose(seen[0].position, np.array([1.0, 0.0, 0.0])))
     joint = np.block([[after, after], [after, after + 1e-6 * np.eye(3)]])
-    (wall, other), cov = without_days_biases(known, BIAS_M, [*seen, new], joint)
+    (wall, other), cov = without_days_biases(known, None, BIAS_M, [*seen, new], joint)
     assert wall.id == 3
     assert other is new
     assert np.linalg.eigvalsh(cov).min() > 0
