@@ -86,6 +86,8 @@ def load_known_map(directory: Path, matching: ScanMatchingConfig | None = None) 
     )
     bias_m = saved.config.front_end.floor_normal_m
     cov = landmark_covariance(saved.joint, landmarks, biases=False)
+    # the log saw the walls with the errors of its own day
+    cov = with_surface_biases(landmarks, cov, bias_m)
     itself, known = known_on_a_day(landmarks, cov, bias_m)
     places = latest_places(_submaps(directory, saved, matching))
     name, sha256 = directory.absolute().name, _digest(directory)
@@ -135,7 +137,7 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
         earlier.known, earlier.itself, earlier.bias_m, result.landmarks, cov
     )
     itself, known = known_on_a_day(landmarks, cov, bias_m)
-    landmarks = with_covariances(landmarks, with_surface_biases(landmarks, cov, bias_m))
+    landmarks = with_covariances(landmarks, cov)
     found = build_submaps(result.estimate.states, result.keyframe_scans, result.config)
     places = latest_places([*found, *earlier.places])
     # named by its folder, identified by its content

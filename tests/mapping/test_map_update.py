@@ -91,3 +91,32 @@ def test_a_new_landmark_stays_where_the_log_saw_it():
     assert np.linalg.eigvalsh(cov).min() > 0
     # the map knew where the wall was: the day saw it 2 cm off, by its bias
     assert abs(between(WALLS[3], wall.position)[1]) < 0.1 * BIAS_M
+
+
+def test_a_new_wall_weighs_as_much_as_the_days_after():
+    """Breaks if the day that a wall is new says exactly where it is, and later ones hardly do."""
+    marks, shifts = [landmark(3, WALLS[3])], np.array([0.012, -0.006])
+    nothing = known_from([landmark(5, WALLS[5])], np.eye(3))
+    exact = np.diag([1.0, 1e-8, 1e-8])
+    at_first = landmark(3, compose(WALLS[3], np.array([0.0, shifts[0], 0.0])))
+    (first,), cov = without_days_biases(nothing, None, BIAS_M, [at_first], exact)
+    known = known_from([first], with_surface_biases([first], cov, BIAS_M))
+    seen, after = a_day(known, marks, shifts[1:])
+    (found,), _ = without_days_biases(known, known_from([first], cov), BIAS_M, seen, after)
+    # a tenth of a millimetre is what is known of its line, and turns by as much
+    assert between(WALLS[3], found.position)[1] == pytest.approx(shifts.mean(), abs=2e-4)
+
+
+def test_what_is_known_of_walls_is_not_hidden_by_the_error_of_a_day():
+    """A day's sparse form is exact to a few per cent of its error, 1 cm: more than is known of a
+    wall, 1 mm. Breaks if a wall is averaged by what is left of it."""
+    marks = [landmark(3, WALLS[3])]
+    cov = np.diag([1.0, 1e-6, 1e-8])
+    wider = 1.1 * with_surface_biases(marks, cov, BIAS_M)
+    known = known_from(marks, wider)
+    seen, after = a_day(known, marks, np.array([BIAS_M]))
+    itself = known_from(marks, cov)
+    (found,), left = without_days_biases(known, itself, BIAS_M, seen, after)
+    # gain 1e-6 over 1.1 * 1.01e-4: 0.09 mm, where it would be 1 mm
+    assert 0.0 < between(WALLS[3], found.position)[1] < 1.2e-4
+    assert left[1, 1] <= cov[1, 1]
