@@ -34,7 +34,8 @@ MARGIN_M = 0.2
 #: m, rad: along a wall, and its direction, of which returns say nothing
 OPEN_M, OPEN_RAD = 1.0, 0.2
 #: returns on a wall that has no observation in the scan yet; such walls per scan, those with the
-#: most returns first. More hardly tell more (two: 2 % of the error), and cost as much again
+#: most returns first. More hardly tell more (two: 2 % of the error), and cost as much again. The
+#: scan at a start has all of them
 LEAST_RETURNS, MOST_WALLS = 2, 1
 #: scans that are looked at together: their observations are compared with all their returns
 BLOCK = 64
