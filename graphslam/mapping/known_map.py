@@ -30,7 +30,10 @@ class KnownMap:
 
     ``name`` of the result that it is of, ``sha256`` of its content. ``landmarks``: all of them;
     ``known``: their joint Gaussian as a day sees them, each wall with an error of its own across
-    it, of sigma ``bias_m``. ``places``: submaps at poses in the world. ``parents``: the maps that
+    it, of sigma ``bias_m``; ``itself``: that without this error, which the next map is made from
+    (None in older files, where it has to do with what is left of ``known``). What the sparse form
+    of ``known`` neglects is small against the error of a day, but not against what is known of
+    walls. ``places``: submaps at poses in the world. ``parents``: the maps that
     it continues, the first one first, name and sha256 each. ``is_world_given``: whether its world
     frame was told by a start, and not only the first pose of a robot.
     """
@@ -41,6 +44,7 @@ class KnownMap:
     known: KnownLandmarks
     places: tuple[SubmapPose, ...]
     bias_m: float = 0.0
+    itself: KnownLandmarks | None = None
     parents: tuple[tuple[str, str], ...] = ()
     is_world_given: bool = False
 

@@ -34,7 +34,8 @@ MARGIN_M = 0.2
 #: m, rad: along a wall, and its direction, of which returns say nothing
 OPEN_M, OPEN_RAD = 1.0, 0.2
 #: returns on a wall that has no observation in the scan yet; such walls per scan, those with the
-#: most returns first. More hardly tell more (two: 2 % of the error), and cost as much again
+#: most returns first. More hardly tell more (two: 2 % of the error), and cost as much again. The
+#: scan at a start has all of them
 LEAST_RETURNS, MOST_WALLS = 2, 1
 #: scans that are looked at together: their observations are compared with all their returns
 BLOCK = 64
@@ -72,9 +73,12 @@ def with_loose_returns(
     )
     changed: dict[int, Association] = {}
     new: dict[State, list[Association]] = {}
+    begins = _first_states(steps, estimate)
     for begin in range(0, len(used), BLOCK):
         views = _Views.of(used[begin : begin + BLOCK], estimate)
-        for before, after in _observed(views, _Seen.of(seen, views, row), tree, numbers, config):
+        most = np.where([state in begins for state in views.states], len(walls), MOST_WALLS)
+        own = _Seen.of(seen, views, row)
+        for before, after in _observed(views, own, tree, numbers, most, config):
             if before is not None:
                 changed[id(before)] = after
             else:
@@ -82,12 +86,31 @@ def with_loose_returns(
     return tuple(_changed(step, changed, new) for step in steps)
 
 
+def _first_states(steps: Sequence[Step], estimate: Estimate) -> set[State]:
+    """Those of which the starts of robots are priors.
+
+    By their scans alone the direction of all that was driven is known where a start is told.
+    """
+    return {
+        (robot, int(estimate.states[robot].stamps_ns[0]))
+        for step in steps
+        for robot in step.starts
+        if robot in estimate.states
+    }
+
+
 def _observed(
-    views: "_Views", seen: "_Seen", tree: WallTree, numbers: IntArray, config: FrontEndConfig
+    views: "_Views",
+    seen: "_Seen",
+    tree: WallTree,
+    numbers: IntArray,
+    most: IntArray,
+    config: FrontEndConfig,
 ) -> Iterator[tuple[Association | None, Association]]:
     """Observations of walls with the loose returns on these, each with that before, if any.
 
-    ``numbers`` (n,): of the landmarks that the walls of the tree are.
+    ``numbers`` (n,): of the landmarks that the walls of the tree are. ``most`` (k,): walls of each
+    scan of the views that get an observation.
     """
     walls = len(numbers)
     loose = np.flatnonzero(~_in_segments(seen, views, config.split_m))
@@ -113,7 +136,7 @@ def _observed(
     for n, k in zip(np.flatnonzero(has).tolist(), known[has].tolist(), strict=True):
         before = seen.associations[k]
         yield before, before.with_measurement(z[n], cov[n])
-    for n in _most_seen(np.bincount(of), scan, ~has).tolist():
+    for n in _most_seen(np.bincount(of), scan, ~has, most).tolist():
         robot, time_ns = views.states[scan[n]]
         extent = np.array([low[n], high[n]]) - middle[n]
         number = int(numbers[wall[n]])
@@ -262,12 +285,12 @@ def _measured(
     return moved, turn @ V @ turn.mT
 
 
-def _most_seen(count: IntArray, scan: IntArray, new: BoolArray) -> IntArray:
-    """Rows of the new walls to be observed: of each scan those with the most returns."""
+def _most_seen(count: IntArray, scan: IntArray, new: BoolArray, most: IntArray) -> IntArray:
+    """Rows of the new walls to be observed: of each ``scan`` the ``most`` with most returns."""
     rows = np.flatnonzero(new & (count >= LEAST_RETURNS))
     rows = rows[np.lexsort((-count[rows], scan[rows]))]
     rank = np.arange(len(rows)) - np.searchsorted(scan[rows], scan[rows])
-    return np.asarray(rows[rank < MOST_WALLS])
+    return np.asarray(rows[rank < most[scan[rows]]])
 
 
 def _along_and_across(points: Array, lines: Array, of: IntArray) -> tuple[Array, Array]:

@@ -34,6 +34,7 @@ def with_surface_biases(landmarks: Sequence[Landmark], cov: Array, bias_m: float
 
 def without_days_biases(
     known: KnownLandmarks,
+    itself: KnownLandmarks | None,
     bias_m: float,
     landmarks: Sequence[Landmark],
     cov: Array,
@@ -42,24 +43,29 @@ def without_days_biases(
 
     Args:
         known: what the log was given, with an error of ``bias_m`` across each wall.
+        itself: the same without this error; None: what ``known`` is without it.
         bias_m: sigma, m.
         landmarks: as the log saw them, those of the map that are still there and new ones.
         cov: (D, D) of them, errors of walls along each one's own axes.
 
+    A wall that is new has the error of the day that saw it: later ones weigh as much as it does.
     The time grows with the cube of their number.
     """
     kept = [mark for mark in landmarks if mark.id in known.means]
     if not kept:
-        return tuple(landmarks), cov
+        return tuple(landmarks), with_surface_biases(landmarks, cov, bias_m)
     rows = np.concatenate([
         np.arange(first, first + _dim(mark))
         for first, mark in zip(_first(landmarks), landmarks, strict=True)
         if mark.id in known.means
     ])  # fmt: skip
-    K = known.covariance([mark.id for mark in kept])
-    P = K.copy()
-    across = _across(kept)
-    P[across, across] -= bias_m**2
+    numbers = [mark.id for mark in kept]
+    K = known.covariance(numbers)
+    if itself is None:
+        P, across = K.copy(), _across(kept)
+        P[across, across] -= bias_m**2
+    else:
+        P = itself.covariance(numbers)
     gain = np.linalg.solve(K, P).T
     shift = gain @ np.concatenate([_off(known.means[mark.id], mark) for mark in kept])
     moved = {
@@ -70,6 +76,9 @@ def without_days_biases(
     back[np.ix_(rows, rows)] = gain
     out = back @ cov @ back.T
     out[np.ix_(rows, rows)] += P - gain @ P
+    # new walls are where this day saw them
+    fresh = np.setdiff1d(_across(landmarks), rows)
+    out[fresh, fresh] += bias_m**2
     return tuple(moved.get(mark.id, mark) for mark in landmarks), 0.5 * (out + out.T)
 
 

@@ -73,7 +73,11 @@ def part_moved(
         # what visits say of the direction of a long wall is worth more than one that moved costs
         if _length(wall, wall_observations(seen, estimate, mean), landmarks) > LONGEST_M:
             continue
-        prior = _Line(before[wall][0][1:], before[wall][1][1:, 1:]) if wall in before else None
+        prior = None
+        if wall in before:
+            # without the error of this day, which is in the line of this day too
+            own = before[wall][1][1:, 1:] - np.diag([landmarks.bias_m**2, 0.0])
+            prior = _Line(before[wall][0][1:], own)
         places[wall] = _places(seen, estimate, mean, prior, landmarks.bias_m)
     return separated(steps, estimate, landmarks, places, before)
 

@@ -206,8 +206,8 @@ def _visits(
         known = None
         if number in before:
             across, cov = before[number][0][1:], before[number][1].diagonal()[1:]
-            # without the bias of its surface, which is in what the motions leave
-            own = max(cov[0] - landmarks.bias_m**2, SEEN_M**2)
+            # without the biases of its surface, by day, which are in what the motions leave
+            own = max(cov[0] - 2 * landmarks.bias_m**2, SEEN_M**2)
             known = across, np.diag([own, cov[1]])
         names = sorted({a.robot for a in every}, key=lambda name: _began(estimate, name))
         length = PIECE_M if stays[number] else np.inf

@@ -41,6 +41,8 @@ from graphslam.results.scans_file import SCANS_FILE, read_scans
 from graphslam.slam.summary import FORMAT as RESULT_FORMAT
 
 FORMAT = 1
+#: names of arrays of the landmarks without the error of a day begin so
+ITSELF = "itself_"
 KNOWN_MAP_FILE = "known_map.npz"
 
 
@@ -84,12 +86,13 @@ def load_known_map(directory: Path, matching: ScanMatchingConfig | None = None) 
     )
     bias_m = saved.config.front_end.floor_normal_m
     cov = landmark_covariance(saved.joint, landmarks, biases=False)
+    # the log saw the walls with the errors of its own day
     cov = with_surface_biases(landmarks, cov, bias_m)
-    known = known_landmarks(landmarks, cov)
+    itself, known = known_on_a_day(landmarks, cov, bias_m)
     places = latest_places(_submaps(directory, saved, matching))
     name, sha256 = directory.absolute().name, _digest(directory)
     given = saved.config.start.from_truth or bool(saved.config.start.poses)
-    return KnownMap(name, sha256, landmarks, known, places, bias_m, is_world_given=given)
+    return KnownMap(name, sha256, landmarks, known, places, bias_m, itself, is_world_given=given)
 
 
 def known_map_of(config: Config) -> KnownMap | None:
@@ -130,14 +133,16 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
         raise OutputError("known_map.update: the result has no joint covariance")
     bias_m = result.config.front_end.floor_normal_m
     cov = landmark_covariance(joint, result.landmarks, biases=False)
-    landmarks, cov = without_days_biases(earlier.known, earlier.bias_m, result.landmarks, cov)
-    cov = with_surface_biases(landmarks, cov, bias_m)
-    landmarks, known = with_covariances(landmarks, cov), known_landmarks(landmarks, cov)
+    landmarks, cov = without_days_biases(
+        earlier.known, earlier.itself, earlier.bias_m, result.landmarks, cov
+    )
+    itself, known = known_on_a_day(landmarks, cov, bias_m)
+    landmarks = with_covariances(landmarks, cov)
     found = build_submaps(result.estimate.states, result.keyframe_scans, result.config)
     places = latest_places([*found, *earlier.places])
     # named by its folder, identified by its content
     return KnownMap(
-        "", "", landmarks, known, places, bias_m, earlier.ancestry, earlier.is_world_given
+        "", "", landmarks, known, places, bias_m, itself, earlier.ancestry, earlier.is_world_given
     )
 
 
@@ -190,6 +195,18 @@ def known_landmarks(landmarks: Sequence[Landmark], cov: Array) -> KnownLandmarks
     return KnownLandmarks(means, tuple(means), root)
 
 
+def known_on_a_day(
+    landmarks: Sequence[Landmark], cov: Array, bias_m: float
+) -> tuple[KnownLandmarks, KnownLandmarks]:
+    """Landmarks with their joint covariance (D, D), and as a day sees them, with its error (m).
+
+    The latter is of the former's sparse form, so that it is nowhere more certain with the error.
+    """
+    itself = known_landmarks(landmarks, cov)
+    cov = itself.covariance([mark.id for mark in landmarks])
+    return itself, known_landmarks(landmarks, with_surface_biases(landmarks, cov, bias_m))
+
+
 def _submaps(directory: Path, saved: SavedResult, matching: ScanMatchingConfig) -> list[SubmapPose]:
     """Submaps along the paths of a result."""
     placed = read_scans(directory / SCANS_FILE)
@@ -217,7 +234,6 @@ def _digest(directory: Path) -> str:
 
 def known_map_bytes(known: KnownMap) -> bytes:
     """The content of the file."""
-    root = known.known.root
     clouds = [cloud for p in known.places for cloud in p.submap.clouds]
     arrays: dict[str, Any] = {
         "format": np.array(FORMAT),
@@ -227,10 +243,8 @@ def known_map_bytes(known: KnownMap) -> bytes:
             json.dumps([landmark_json(mark) for mark in known.landmarks]).encode(), dtype=np.uint8
         ),
         "parents": np.array([list(p) for p in known.parents], dtype=np.str_).reshape(-1, 2),
-        "parent_count": np.array([len(p) for p in root.parents], dtype=np.int32),
-        "parent": np.array([n for p in root.parents for n in p], dtype=np.int32),
-        "rows": np.concatenate([np.zeros(0), *(row.ravel() for row in root.rows)]),
-        "widening": np.array(root.widening),
+        **_root_arrays(known.known.root, ""),
+        **(_root_arrays(known.itself.root, ITSELF) if known.itself else {}),
         "bias_m": np.array(known.bias_m),
         "is_world_given": np.array(known.is_world_given),
         "place_pose": np.array([p.pose for p in known.places]).reshape(-1, 3),
@@ -242,6 +256,33 @@ def known_map_bytes(known: KnownMap) -> bytes:
     made = BytesIO()
     np.savez(made, **arrays)
     return made.getvalue()
+
+
+def _root_arrays(root: SparseRoot, prefix: str) -> dict[str, Array]:
+    return {
+        f"{prefix}parent_count": np.array([len(p) for p in root.parents], dtype=np.int32),
+        f"{prefix}parent": np.array([n for p in root.parents for n in p], dtype=np.int32),
+        f"{prefix}rows": np.concatenate([np.zeros(0), *(row.ravel() for row in root.rows)]),
+        f"{prefix}widening": np.array(root.widening),
+    }
+
+
+def _root(arrays: Mapping[str, Array], prefix: str, dims: Sequence[int]) -> SparseRoot:
+    parent_count, parent, values = (
+        arrays[f"{prefix}{name}"] for name in ("parent_count", "parent", "rows")
+    )
+    parents = [tuple(part.tolist()) for part in np.split(parent, np.cumsum(parent_count)[:-1])][
+        : len(dims)
+    ]
+    shapes = [
+        (dim, dim + sum(dims[n] for n in before)) for dim, before in zip(dims, parents, strict=True)
+    ]
+    sizes = np.cumsum([a * b for a, b in shapes], dtype=np.int64)[:-1]
+    rows = [
+        part.reshape(shape)
+        for part, shape in zip(np.split(values, sizes), shapes, strict=bool(shapes))
+    ]
+    return SparseRoot(tuple(parents), tuple(rows), float(arrays[f"{prefix}widening"]))
 
 
 def _read(path: Path, name: str, matching: ScanMatchingConfig) -> KnownMap:
@@ -265,19 +306,6 @@ def _known_map(
     landmarks = tuple(map(landmark_from_json, json.loads(arrays["landmarks"].tobytes())))
     means = {mark.id: mark.position[: 2 if mark.kind == "point" else 3] for mark in landmarks}
     dims = [len(mean) for mean in means.values()]
-    parents = [
-        tuple(part.tolist())
-        for part in np.split(arrays["parent"], np.cumsum(arrays["parent_count"])[:-1])
-    ][: len(dims)]
-    shapes = [
-        (dim, dim + sum(dims[n] for n in before)) for dim, before in zip(dims, parents, strict=True)
-    ]
-    sizes = np.cumsum([a * b for a, b in shapes], dtype=np.int64)[:-1]
-    rows = [
-        part.reshape(shape)
-        for part, shape in zip(np.split(arrays["rows"], sizes), shapes, strict=bool(shapes))
-    ]
-    root = SparseRoot(tuple(parents), tuple(rows), float(arrays["widening"]))
     clouds = np.split(arrays["points"].astype(float), np.cumsum(arrays["count"])[:-1])
     first = np.concatenate([[0], np.cumsum(arrays["place_scans"])]).tolist()
     places = tuple(
@@ -286,10 +314,13 @@ def _known_map(
             zip(arrays["place_pose"], pairwise(first), strict=True)
         )
     )
-    known = KnownLandmarks(means, tuple(means), root)
+    known = KnownLandmarks(means, tuple(means), _root(arrays, "", dims))
+    itself = None
+    if f"{ITSELF}rows" in arrays:
+        itself = replace(known, root=_root(arrays, ITSELF, dims))
     told = tuple((str(a), str(b)) for a, b in arrays["parents"])
     if str(arrays["name"]):  # a copy
         name, sha256 = str(arrays["name"]), str(arrays["sha256"])
     bias_m = float(arrays.get("bias_m", 0.0))  # of older ones it is not known
     given = bool(arrays.get("is_world_given", False))
-    return KnownMap(name, sha256, landmarks, known, places, bias_m, told, given)
+    return KnownMap(name, sha256, landmarks, known, places, bias_m, itself, told, given)

@@ -7,7 +7,7 @@ import pytest
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import compose, rotation3
-from graphslam.core.records import Association, Estimate, KeyframeScan, Step, Trajectory
+from graphslam.core.records import Association, Estimate, KeyframeScan, Start, Step, Trajectory
 from graphslam.mapping.landmark_map import Entry
 from graphslam.mapping.loose_returns import LEAST_RETURNS, MOST_WALLS, with_loose_returns
 
@@ -30,12 +30,17 @@ def seen(number, line, extent=(-1.0, 1.0), sigmas=(1.0, 0.01, 0.006)):
     return Association("r", 5, number, "line", np.array(line), cov, extent=np.array(extent))
 
 
-def used(points, walls, associations=(), config=CONFIG, sensor=(0.0, 0.0, 0.0)):
-    """The associations of one step whose scan has these returns."""
-    states = {"r": Trajectory(np.array([5]), STATE[None], np.zeros((1, 3, 3)))}
+def used(points, walls, associations=(), config=CONFIG, sensor=(0.0, 0.0, 0.0), began=None):
+    """The associations of one step whose scan has these returns; with a start that ``began``."""
+    starts = {} if began is None else {"r": Start(STATE, np.eye(3))}
+    stamps = np.array([5] if began in (None, 5) else [began, 5])
+    poses = np.tile(STATE, (len(stamps), 1))
+    states = {"r": Trajectory(stamps, poses, np.zeros((len(stamps), 3, 3)))}
     marks = {wall.id: (wall.mean, np.eye(3)) for wall in walls}
     scan = KeyframeScan("r", 5, np.array(points, dtype=np.float32), np.array(sensor))
-    step = Step(5, {}, {}, tuple(associations) or (Association("r", 5, 99, "point", *POINT),), ())
+    step = Step(
+        5, starts, {}, tuple(associations) or (Association("r", 5, 99, "point", *POINT),), ()
+    )
     (made,) = with_loose_returns(
         [step], Estimate(states, marks, 0.0, 0), [scan], {wall.id: wall for wall in walls}, config
     )
@@ -115,6 +120,18 @@ def test_of_several_walls_those_with_the_most_returns():
     points = on(AHEAD, 3.0, 3.4) + on(left, -3.0, -3.4, -3.8)
     _, *lines = used(points, [entry(7, AHEAD), entry(8, left)])
     assert MOST_WALLS == 1 and [a.target for a in lines] == [8]
+
+
+def test_of_the_scan_at_a_start_all_walls_are_used():
+    """Breaks if the direction of the world is by fewer walls than the first scan has, or if later
+    scans of a robot are taken for its first."""
+    left = np.array([0.0, 1.2, np.pi])
+    points = on(AHEAD, 3.0, 3.4) + on(left, -3.0, -3.4, -3.8)
+    walls = [entry(7, AHEAD), entry(8, left)]
+    _, *lines = used(points, walls, began=5)
+    assert {a.target for a in lines} == {7, 8}
+    _, *later = used(points, walls, began=3)
+    assert len(later) == MOST_WALLS
 
 
 @pytest.mark.parametrize(
