@@ -14,6 +14,7 @@ import numpy as np
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array
+from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.estimation.recorded_graph import RecordedGraph
 
@@ -67,6 +68,7 @@ def clock_errors(
     clock = int(gtsam.symbol("t", 0))
     size, units = 2 * len(robots), np.array([OFFSET_S, DRIFT])
     unit = gtsam.noiseModel.Unit.Create(size)
+    rows = {model.rows: gtsam.noiseModel.Unit.Create(model.rows) for model in MODELS.values()}
     nonlinear = [builder.graph.at(index) for index, _ in builder.robot_observations]
     for index, _ in builder.robot_observations:
         builder.graph.remove(index)
@@ -75,6 +77,7 @@ def clock_errors(
     linear.add(gtsam.JacobianFactor(clock, np.eye(size), -so_far, unit))
     columns = np.column_stack([np.ones(len(after_s)), after_s]) * units
     number = {seen: n for n, (_, seen) in enumerate(robot_associations(steps))}
+    place = {robot: 2 * k for k, robot in enumerate(robots)}
     for observed, (_, (key, target, seen)) in zip(
         nonlinear, builder.robot_observations, strict=True
     ):
@@ -83,13 +86,12 @@ def clock_errors(
         first = factor.keys()[0] == key
         A_key, A_target = (A[:, :3], A[:, 3:]) if first else (A[:, 3:], A[:, :3])
         C = np.zeros((len(b), size))
-        along = np.outer(A_target @ velocities[n], columns[n])
-        for robot, sign in ((str(seen.target), 1.0), (seen.robot, -1.0)):
-            if robot in prior:
-                at = 2 * robots.index(robot)
-                C[:, at : at + 2] += sign * along
-        rows = gtsam.noiseModel.Unit.Create(len(b))
-        linear.add(gtsam.JacobianFactor(key, A_key, target, A_target, clock, C, b, rows))
+        along = (A_target @ velocities[n])[:, None] * columns[n]
+        if (at := place.get(str(seen.target))) is not None:
+            C[:, at : at + 2] += along
+        if (at := place.get(seen.robot)) is not None:
+            C[:, at : at + 2] -= along
+        linear.add(gtsam.JacobianFactor(key, A_key, target, A_target, clock, C, b, rows[len(b)]))
     try:
         order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, [clock])
         net = linear.eliminateSequential(order)

@@ -114,7 +114,9 @@ def _thinned(points: Array) -> Array:
     owner = np.repeat(np.arange(len(first)), np.diff(first, append=len(points)))
     order = np.lexsort((points[:, 1], owner))  # by column, then by height
     last = np.append(first[1:], len(points)) - 1
-    points = points[np.unique(np.concatenate([first, last, order[first], order[last]]))]
+    seen = np.zeros(len(points), dtype=np.bool_)
+    seen[first] = seen[last] = seen[order[first]] = seen[order[last]] = True
+    points = points[seen]
     piece = np.cumsum(np.hypot(*np.diff(points, axis=0, prepend=points[:1]).T)) // _FINE
     kept = np.diff(piece, prepend=-1) > 0
     kept[-1] = True
