@@ -50,7 +50,12 @@ MANY_MOTIONS = 1000
 
 
 class Track(Readings):
-    """Odometry readings of one robot and its motions between any two times."""
+    """Odometry readings of one robot and its motions between any two times.
+
+    ``summed_together``: whether `preintegrate_batch` may integrate it with other tracks.
+    """
+
+    summed_together = True
 
     def __init__(
         self,
@@ -336,7 +341,12 @@ def preintegrate_batch(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> lis
 
     ``asked``: tracks with the start times (n,) and end times (n,) of motions.
     """
-    return in_windows(asked, _integrated)
+    together = [one for one in asked if one[0].summed_together]
+    summed = iter(in_windows(together, _integrated) if together else ())
+    return [
+        next(summed) if track.summed_together else track.motions(start_ns, end_ns)
+        for track, start_ns, end_ns in asked
+    ]
 
 
 def _integrated(asked: Sequence[tuple[Track, IntArray, IntArray]]) -> list[Motions]:

@@ -38,6 +38,8 @@ class SeveralLasersTrack(Track):
     Times are states of the first laser, unless they were added by `add_states`.
     """
 
+    summed_together = False  # the states of each laser are elsewhere
+
     def __init__(self, config: OdometryConfig, robot: RobotConfig, sensors: Sequence[str]) -> None:
         """An empty track; ``sensors``: names of the further lasers."""
         self._sensors = tuple(sensors)
