@@ -53,11 +53,11 @@ class ClosedLoops:
     """The result of `close_loops`.
 
     ``correcting`` closures were found by a search; those found where the submaps lay only confirm
-    the path. ``refused`` is the number of those that were inconsistent, and stayed so.
+    the path. ``refused`` are the pairs of those that were inconsistent, and stayed so.
     """
 
     correcting: tuple[Closure, ...]
-    refused: int
+    refused: frozenset[Pair]
 
 
 class _Closer:
@@ -219,4 +219,4 @@ def close_loops(
     graph.begin_with(None)
     graph.solve(closer.relative_poses() if closer.accepted else None)
     correcting = [c for pair, c in closer.accepted.items() if pair in closer.correcting]
-    return ClosedLoops(tuple(correcting), len(closer.refused - set(closer.accepted)))
+    return ClosedLoops(tuple(correcting), frozenset(closer.refused - closer.accepted.keys()))

@@ -94,13 +94,27 @@ def optimise_scan_log(
     fixing = sum(fix_position(paths.closures))
     counts["closures_verified"] = fixing
     counts["closures_across"] = len(paths.closures) - fixing
-    counts["closures_refused"] += paths.refused
+    counts["closures_refused"] += len(paths.refused)
+    placed = _visits_placed(scan_log)
+    between = [a for a, b in paths.refused if a[0] != b[0] and {a[0], b[0]} & placed]
+    counts["closures_refused_between"] += len(between)
     with timed(seconds, "final"):
         if scan_log.known.known_map is not None:
             counts["closures_to_map"] = paths.to_map
         estimate, steps = _solved(steps, paths, scan_log, tracks)
     scan_log.steps = list(steps)
     return estimate
+
+
+def _visits_placed(scan_log: TrackedLog) -> set[str]:
+    """Visits that were placed by what they have in common, and not where somebody told.
+
+    What else would fit was judged then, place by place.
+    """
+    told = scan_log.given_config.start
+    if scan_log.known.known_map is not None:  # there what was told is only a hint
+        return set(scan_log.started)
+    return set() if told.from_truth else scan_log.started.keys() - told.poses.keys()
 
 
 def _start(steps: Sequence[Step], paths: ClosedPaths, scan_log: TrackedLog) -> Estimate:
@@ -296,9 +310,8 @@ def _with_displaced_starts(
     steps: Sequence[Step], by: Mapping[str, Array], scan_log: TrackedLog
 ) -> tuple[Step, ...]:
     """Steps in which starts that were found, not told, are displaced ``by`` (2,) m as well."""
-    told = scan_log.given_config.start
-    if scan_log.known.known_map is None:  # there what was told is only a hint
-        by = {} if told.from_truth else {n: off for n, off in by.items() if n not in told.poses}
+    placed = _visits_placed(scan_log)
+    by = {name: off for name, off in by.items() if name in placed}
 
     def at(name: str, start: Start) -> Start:
         return replace(start, pose=start.pose + np.append(by[name], 0.0)) if name in by else start

@@ -10,7 +10,7 @@ from graphslam.core.geometry import Array, between, compose, exp, log, path_leng
 from graphslam.core.records import Closure, Step, Trajectory
 from graphslam.mapping.doubled_walls import ON_M
 from graphslam.mapping.known_map import MAP_ROBOT, KnownMap
-from graphslam.mapping.loop_closure import Tamper
+from graphslam.mapping.loop_closure import Pair, Tamper
 from graphslam.mapping.redundant_closures import Span
 from graphslam.mapping.sequential_closing import close_loops
 from graphslam.mapping.submap_graph import SubmapConstraints, SubmapGraph
@@ -30,7 +30,7 @@ class ClosedPaths:
     """Paths after their loops were closed.
 
     ``states``: robot -> poses at all its states. ``closures`` are those that corrected the paths,
-    ``refused`` the number of inconsistent ones; ``spans``: state of a submap -> the time that its
+    ``refused`` the pairs of inconsistent ones; ``spans``: state of a submap -> the time that its
     robot was around there. ``graph`` is that of the submaps, ``times`` and ``first``: robot ->
     times of its nodes in it, and the number of the first. ``places`` are the nodes of a known map,
     ``known`` the numbers of its landmarks; ``to_map``: how many closures are with its places.
@@ -38,7 +38,7 @@ class ClosedPaths:
 
     states: Mapping[str, Trajectory]
     closures: Sequence[Closure]
-    refused: int
+    refused: frozenset[Pair]
     spans: Mapping[State, Span]
     graph: SubmapGraph
     times: Mapping[str, IntArray]

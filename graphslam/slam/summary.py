@@ -32,6 +32,7 @@ REOPTIMISED = (
     "closures_verified",
     "closures_across",
     "closures_refused",
+    "closures_refused_between",
     "closures_kept",
     "landmarks_merged",
     "landmarks_moved",

@@ -130,7 +130,10 @@ def _misfit(evidence: Evidence) -> Iterable[Reason]:
 def _closures(evidence: Evidence) -> Iterable[Reason]:
     """A path that comes back elsewhere than where its scans, or the log, say that it is."""
     counts = evidence.summary.get("consolidated") or {}
-    refused, verified = (counts.get(f"closures_{which}", 0) for which in ("refused", "verified"))
+    refused, between, verified = (
+        counts.get(f"closures_{which}", 0) for which in ("refused", "refused_between", "verified")
+    )
+    refused -= between  # what they say of where a session is, the sessions' own check says
     if refused >= REFUSED[0] and refused > REFUSED[1] * (refused + verified):
         text = (
             f"{refused} of {refused + verified} pairs of places that look the same are not joined, "

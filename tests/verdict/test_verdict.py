@@ -510,10 +510,20 @@ def test_a_closure_that_the_path_misses_is_doubted_and_one_that_leaves_a_directi
     assert verdict == "doubtful" and "the places at 50.0 s and 0.0 s are the same" in told
 
 
-@pytest.mark.parametrize(("refused", "verdict"), [(3, "good"), (6, "doubtful")])
-def test_places_that_look_the_same_and_are_not_joined_are_doubted(refused, verdict):
-    """Of 20 laps through a building with some rooms that are alike a few are to be expected."""
-    counts = {"consolidated": {"closures_refused": refused, "closures_verified": 26}}
+@pytest.mark.parametrize(
+    ("refused", "between", "verdict"), [(3, 0, "good"), (6, 0, "doubtful"), (6, 5, "good")]
+)
+def test_places_that_look_the_same_and_are_not_joined_are_doubted(refused, between, verdict):
+    """Of 20 laps through a building with some rooms that are alike a few are to be expected. Those
+    between sessions that were placed by all that they have in common were judged then: three of six
+    right maps of five days in a building whose halves are alike were doubtful by them."""
+    counts = {
+        "consolidated": {
+            "closures_refused": refused,
+            "closures_refused_between": between,
+            "closures_verified": 26,
+        }
+    }
     assert reasons(replace(evidence(), summary=SUMMARY | counts))[0] == verdict
 
 
