@@ -20,8 +20,8 @@ from graphslam.core.records import Estimate, Motion, Start, Step, Trajectory
 from graphslam.estimation.log_noise import MOTION, LogNoise
 from graphslam.estimation.posterior_residuals import Posterior, spans
 from graphslam.odometry.increment_sums import IncrementSums
+from graphslam.odometry.integration_windows import Asked
 from graphslam.odometry.noise_estimation import (
-    Asked,
     fit_noise,
     is_stated,
     motion_variances,
@@ -137,7 +137,7 @@ def fit_odometry_noise(
         posterior: a solution.
         relax: see `fit_noise`.
     """
-    asked, shown = dict[str, Asked](), dict[str, tuple[Array, Array, Array]]()
+    asked, shown = dict[str, Asked[Track]](), dict[str, tuple[Array, Array, Array]]()
     for robot, track in tracks.items():
         own = [step.motions[robot] for step in posterior.steps if robot in step.motions]
         times = _times(own)

@@ -140,24 +140,28 @@ def _aligned(distance: Array, turn: Array) -> dict[str, float | None]:
 class PathErrors:
     """Errors of one robot's poses: what the numbers of one or several robots are made of.
 
-    ``estimate`` and ``truth`` (n, 3); ``errors`` (n, 3), their difference; ``relative``: name of a
-    span in `SPANS` -> `relative_errors` (k, 3) over it; ``nees``: of the poses.
+    ``estimate`` and ``truth`` are poses (n, 3); ``relative``: name of a span in `SPANS` ->
+    `relative_errors` (k, 3) over it; ``nees``: of the poses.
     """
 
     estimate: Array
     truth: Array
-    errors: Array
     relative: Mapping[str, Array]
     nees: NeesSeries
 
 
 def path_errors(pairs: PosePairs) -> PathErrors:
     """The errors of one robot's poses."""
-    errors = pairs.estimate - pairs.truth
-    errors[:, 2] = wrap(errors[:, 2])
     relative = {name: relative_errors(pairs, **span) for name, span in SPANS.items()}
-    series = nees_series(errors, pairs.covs)
-    return PathErrors(pairs.estimate, pairs.truth, errors, relative, series)
+    series = nees_series(_differences(pairs.estimate, pairs.truth), pairs.covs)
+    return PathErrors(pairs.estimate, pairs.truth, relative, series)
+
+
+def _differences(estimate: Array, truth: Array) -> Array:
+    """Errors (n, 3) of poses along the axes of the world, m and rad."""
+    errors = estimate - truth
+    errors[:, 2] = wrap(errors[:, 2])
+    return errors
 
 
 def trajectory_metrics(robots: Sequence[PathErrors]) -> dict[str, Any]:
@@ -171,12 +175,11 @@ def trajectory_metrics(robots: Sequence[PathErrors]) -> dict[str, Any]:
     Raises:
         ValueError: there is no pair at all.
     """
-    estimate, truth, errors = (
-        np.concatenate([getattr(one, name) for one in robots])
-        for name in ("estimate", "truth", "errors")
-    )
+    estimate = np.concatenate([one.estimate for one in robots])
+    truth = np.concatenate([one.truth for one in robots])
     if not len(truth):
         raise ValueError("no pair of poses")
+    errors = _differences(estimate, truth)
     distance = np.hypot(errors[:, 0], errors[:, 1])
     alignment = align_poses(estimate, truth)
     left = np.hypot(*(transform(alignment, estimate[:, :2]) - truth[:, :2]).T)

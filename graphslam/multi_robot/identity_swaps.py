@@ -67,7 +67,7 @@ def find_swapped_identities(
             )
         return float(np.median(np.hypot(*(seen.points - position).T)))
 
-    own_m = {name: distance_m(name, name) for name in sighted}
+    own_m = {name: distance_m(name, name) for name in {n for pair in pairs for n in pair}}
 
     def lies_nearer(identity: str, subject: str) -> bool:
         """Whether the sightings of an identity are much nearer to this subject."""

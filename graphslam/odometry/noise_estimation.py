@@ -10,7 +10,6 @@ Estimating heteroscedastic variances in linear models, JASA 70, 1975, DOI
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeAlias
 
 import numpy as np
 
@@ -20,12 +19,11 @@ from graphslam.core.geometry import Array
 from graphslam.core.motion_models import RATES, rates_of_config, with_rates
 from graphslam.core.non_negative import non_negative_least_squares
 from graphslam.odometry.increment_sums import transformed
+from graphslam.odometry.integration_windows import Asked
 from graphslam.odometry.mounted_motions import lever_to
-from graphslam.odometry.path_sums import path_sums
+from graphslam.odometry.path_sums import numbered_times, path_sums
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 
-#: a track with the times (n,) at which motions begin and those (n,) at which they end
-Asked: TypeAlias = tuple[Track, IntArray, IntArray]
 #: sigma of the logarithm of an unknown variance, before any data: a factor of ten
 PRIOR_LOG_SIGMA = math.log(10.0)
 #: m, rad: floors of short motions; that of positions is above what cutting readings leaves out
@@ -169,7 +167,9 @@ def clipped(normalised: Array) -> Array:
     return np.asarray(np.clip(normalised, -cut, cut))
 
 
-def motion_variances(asked: Sequence[Asked], configs: Sequence[OdometryConfig]) -> list[Array]:
+def motion_variances(
+    asked: Sequence[Asked[Track]], configs: Sequence[OdometryConfig]
+) -> list[Array]:
     """Variances (n, 3) of the motions of different tracks along their axes by other settings."""
     before = [(track.config, track.calibration) for track, _, _ in asked]
     try:
@@ -197,9 +197,9 @@ def variances_by_rate(track: Track, start_ns: IntArray, end_ns: IntArray) -> Arr
     for block in np.split(np.arange(len(start_ns)), np.flatnonzero(np.diff(number)) + 1):
         start, end = start_ns[block], end_ns[block]
         start, end, mount = track.odometry_spans(start, end)
-        times, at = np.unique(np.concatenate([start, end]), return_inverse=True)
-        sums, _ = path_sums([track], [times], by_rate=True)
-        motions = sums.motions_between(*np.split(at, 2))
+        times, *ends = numbered_times([start], [end])
+        sums, _ = path_sums([track], times, by_rate=True)
+        motions = sums.motions_between(*ends)
         covs = motions.cov
         if mount.any():
             covs = transformed(covs, lever_to(motions.delta, mount))

@@ -285,8 +285,8 @@ def _laid_on_walls(
     solved.
     """
     landmarks = scan_log.landmarks
-    untied = landmarks.copies()
     is_compared = bool(landmarks.known) or len(paths.states) > 1
+    untied = landmarks.copies() if is_compared else {}
     for left in reversed(range(1 + DISPLACED_ROUNDS * is_compared)):
         start = _start(steps, paths, scan_log)
         tied = _tied(steps, start, None, paths, scan_log)

@@ -69,6 +69,7 @@ def test_tracks_with_other_rates_of_noise_are_summed_together_as_by_themselves(a
         alone = [preintegrate_batch([each])[0] for each in both]
     assert most > 5000  # both at once
     for found, expected in zip(together, alone, strict=True):
+        # rounding of sums that begin elsewhere; the noise of a motion is 1e-5 and more
         np.testing.assert_allclose(found.cov, expected.cov, atol=1e-12)
 
 
