@@ -111,6 +111,8 @@ def _best_part(
     two = sum(np.einsum("ni,ni->n", v, line) for (_, v), line in zip(sides, lines, strict=True))
     gain = np.asarray(two) - b[-1] @ np.linalg.solve(A[-1], b[-1])
     best = int(gain.argmax())
+    if not gain[best] > BETTER:
+        return None
     part = np.zeros(n, dtype=np.bool_)
     part[first[best] : end[best]] = True
     ends = np.array([k for k in (first[best], end[best]) if 0 < k < n])
@@ -125,7 +127,7 @@ def _best_part(
     off = lines[0][best] - lines[1][best]
     far = (abs(off[0] + edges * off[1]) > least).all()
     short = min(wall.only(part).length, wall.only(~part).length) < SHORT_M
-    return part if apart and far and short and gain[best] > BETTER else None
+    return part if apart and far and short else None
 
 
 def _inner_runs(along: Array) -> tuple[IntArray, IntArray]:
