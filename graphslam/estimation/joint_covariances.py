@@ -10,7 +10,7 @@ Covariance recovery from a square root information matrix, RAS 57, 2009, DOI
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -96,8 +96,7 @@ def covariance_of(
 ) -> Array:
     """Joint covariance (k, k) of linear combinations of all variables.
 
-    The time is that of k forward substitutions through all of the root, in one go. What is left of
-    them is held only where cliques above need it.
+    The time is that of k forward substitutions through all of the root, in one go.
 
     Args:
         root: of the graph.
@@ -106,6 +105,49 @@ def covariance_of(
         derivatives: (n,) of the combination by the error of the row.
         k: how many combinations there are.
     """
+    P = np.zeros((k, k))
+    # solved rows are multiplied many at a time
+    solved, end = np.zeros((max(int(root.own.max(initial=0)), _CHUNK // max(16 * k, 1)), k)), 0
+    for use, y in _substituted(root, rows, columns, derivatives, k):
+        n = len(y)
+        if end + n > len(solved):
+            P += solved[:end].T @ solved[:end]
+            solved[:end], end = 0.0, 0
+        solved[end : end + n, use] = y
+        end += n
+    P += solved[:end].T @ solved[:end]
+    by_shared = _by_shared(root, rows, columns, derivatives, k)
+    return P + by_shared @ by_shared.T
+
+
+def variances_of(
+    root: InformationRoot, rows: IntArray, columns: IntArray, derivatives: Array, k: int
+) -> Array:
+    """Variances (k,) of linear combinations, the diagonal of `covariance_of`."""
+    found = np.zeros(k)
+    for use, y in _substituted(root, rows, columns, derivatives, k):
+        found[use] += np.einsum("nu,nu->u", y, y)
+    found += (_by_shared(root, rows, columns, derivatives, k) ** 2).sum(axis=1)
+    return found
+
+
+def _by_shared(
+    root: InformationRoot, rows: IntArray, columns: IntArray, derivatives: Array, k: int
+) -> Array:
+    """Linear combinations (k, errors) by what errors share."""
+    found = np.zeros((k, root.shared.shape[1]))
+    if root.shared.size:
+        np.add.at(found, columns, derivatives[:, None] * root.shared[rows])
+    return found
+
+
+def _substituted(
+    root: InformationRoot, rows: IntArray, columns: IntArray, derivatives: Array, k: int
+) -> Iterator[tuple[IntArray, Array]]:
+    """Clique by clique which of k combinations depend on it (u,), and R'⁻¹E there (n, u).
+
+    What is left of the right sides is held only where cliques above need it.
+    """
     starts = np.concatenate([[0], np.cumsum(root.own)])
     widths = np.concatenate([[0], np.cumsum(root.width)])
     values = np.concatenate([[0], np.cumsum(root.own * (root.own + root.width))])
@@ -113,15 +155,17 @@ def covariance_of(
     rows, columns, derivatives = rows[order], columns[order], derivatives[order]
     entering = np.searchsorted(rows, starts)
     below: dict[int, list[tuple[IntArray, IntArray, Array]]] = defaultdict(list)
-    P, place = np.zeros((k, k)), np.empty(k, dtype=np.int64)
-    # solved rows are multiplied many at a time
-    solved, end = np.zeros((max(int(root.own.max(initial=0)), _CHUNK // max(16 * k, 1)), k)), 0
+    place, is_used = np.empty(k, dtype=np.int64), np.zeros(k, dtype=np.bool_)
     for c in reversed(range(len(root.own))):  # the last clique depends on no other
         n, m = int(root.own[c]), int(root.width[c])
         parts, new = below.pop(c, []), slice(entering[c], entering[c + 1])
-        use = np.unique(np.concatenate([columns[new], *(part[1] for part in parts)]))
+        is_used[columns[new]] = True
+        for _, part_columns, _ in parts:
+            is_used[part_columns] = True
+        use = np.flatnonzero(is_used)
         if not len(use):
             continue
+        is_used[use] = False
         place[use] = np.arange(len(use))
         separator = root.separators[widths[c] : widths[c + 1]]
         held = np.concatenate([np.arange(starts[c], starts[c + 1]), separator])
@@ -133,17 +177,7 @@ def covariance_of(
         y, _ = dtrtrs(block[:, :n], b[:n], trans=1)
         if root.above[c] >= 0:
             below[int(root.above[c])].append((separator, use, b[n:] - block[:, n:].T @ y))
-        if end + n > len(solved):
-            P += solved[:end].T @ solved[:end]
-            solved[:end], end = 0.0, 0
-        solved[end : end + n, use] = y
-        end += n
-    P += solved[:end].T @ solved[:end]
-    if root.shared.size:
-        by_shared = np.zeros((k, root.shared.shape[1]))
-        np.add.at(by_shared, columns, derivatives[:, None] * root.shared[rows])
-        P += by_shared @ by_shared.T
-    return P
+        yield use, y
 
 
 def solve_root(root: InformationRoot, right: Array) -> Array:

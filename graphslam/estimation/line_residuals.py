@@ -10,7 +10,7 @@ from graphslam.core.geometry import Array, path_length, rotate_cov, rotation3
 from graphslam.core.observation_models import LineModel
 from graphslam.estimation import factors
 from graphslam.estimation.isam2 import observed_ends
-from graphslam.estimation.joint_covariances import covariance_of
+from graphslam.estimation.joint_covariances import variances_of
 from graphslam.estimation.posterior_residuals import Residuals
 from graphslam.estimation.solved_graph import SolvedGraph
 from graphslam.estimation.weighed_walls import WeighedWalls, weighed_walls
@@ -63,7 +63,7 @@ class LineResiduals(SolvedGraph):
             at = rows[used, None, None] + np.arange(3)
             entries.append([a.ravel() for a in np.broadcast_arrays(at, column[:, :, None], by)])
         at, columns, by = (np.concatenate(part) for part in zip(*entries, strict=True))
-        absorbed = np.diag(covariance_of(self.root, at, columns, by, 2 * len(shown)))
+        absorbed = variances_of(self.root, at, columns, by, 2 * len(shown))
         variance = np.repeat(np.bincount(of)[shown].astype(float), 2)
         return Residuals(sums[shown], variance.reshape(-1, 2), absorbed.reshape(-1, 2))
 

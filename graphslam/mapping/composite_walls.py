@@ -106,11 +106,10 @@ def _best_part(
     A, b = (np.concatenate([0.0 * of[:1], np.cumsum(of, axis=0)]) for of in wall.normal_equations())
     M, v = A[end] - A[first], b[end] - b[first]
     sides = ((M, v), (A[-1] - M, b[-1] - v))
-    lines = [np.linalg.solve(M, v[:, :, None])[:, :, 0] for M, v in sides]
-    # what lines take off the squared error
-    two = sum(np.einsum("ni,ni->n", v, line) for (_, v), line in zip(sides, lines, strict=True))
-    gain = np.asarray(two) - b[-1] @ np.linalg.solve(A[-1], b[-1])
+    gain = sum(_explained(M, v) for M, v in sides) - _explained(A[-1], b[-1])
     best = int(gain.argmax())
+    if not gain[best] > BETTER:
+        return None
     part = np.zeros(n, dtype=np.bool_)
     part[first[best] : end[best]] = True
     ends = np.array([k for k in (first[best], end[best]) if 0 < k < n])
@@ -118,14 +117,23 @@ def _best_part(
     # of a wall that is bent, as its path is, most are across an edge
     over = (wall.ends[:, :1] < edges - ACROSS_M) & (wall.ends[:, 1:] > edges + ACROSS_M)
     fewer = min(np.count_nonzero(part), np.count_nonzero(~part))
-    apart = np.count_nonzero(over.any(axis=1)) <= ACROSS_SHARE * fewer
+    if np.count_nonzero(over.any(axis=1)) > ACROSS_SHARE * fewer:
+        return None
     least = STEP_M
     if not set(wall.robot[part]) & set(wall.robot[~part]):
         least = max(least, VISITS_SIGMAS * np.hypot(bias_m, PATH_M))
-    off = lines[0][best] - lines[1][best]
-    far = (abs(off[0] + edges * off[1]) > least).all()
-    short = min(wall.only(part).length, wall.only(~part).length) < SHORT_M
-    return part if apart and far and short and gain[best] > BETTER else None
+    lines = [np.linalg.solve(M[best], v[best]) for M, v in sides]
+    off = lines[0] - lines[1]
+    if not (abs(off[0] + edges * off[1]) > least).all():
+        return None
+    return part if min(wall.only(part).length, wall.only(~part).length) < SHORT_M else None
+
+
+def _explained(M: Array, v: Array) -> Array:
+    """What the lines of normal equations (..., 2, 2), (..., 2) take off the squared error (...)."""
+    p, q = v[..., 0], v[..., 1]
+    a, b, d = M[..., 0, 0], M[..., 0, 1], M[..., 1, 1]
+    return np.asarray((d * p**2 - 2.0 * b * p * q + a * q**2) / (a * d - b**2))
 
 
 def _inner_runs(along: Array) -> tuple[IntArray, IntArray]:

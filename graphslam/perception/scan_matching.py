@@ -154,13 +154,12 @@ def _information(points: Array, tree: cKDTree, config: ScanMatchingConfig) -> Ar
     """Information (n, 2, 2) of points (n, 2), see `Submap`, by the scatter of their neighbours."""
     k = min(NEIGHBOURS, len(points))
     distance, near = tree.query(points, k=k)
-    used = distance.reshape(len(points), k) <= NEIGHBOURHOOD_CELLS * config.cell_m
-    around = points[near.reshape(len(points), k)]
-    count = used.sum(axis=1)
-    mean = (around * used[..., None]).sum(axis=1) / count[:, None]
-    d = (around - mean[:, None]) * used[..., None]
-    xx, yy = (d[..., 0] ** 2).sum(axis=1), (d[..., 1] ** 2).sum(axis=1)
-    xy = (d[..., 0] * d[..., 1]).sum(axis=1)
+    distance, near = (of.reshape(len(points), k).T for of in (distance, near))
+    used = distance <= NEIGHBOURHOOD_CELLS * config.cell_m  # (k, n)
+    count = used.sum(axis=0)
+    x, y = (of[near] for of in points.T)
+    x, y = ((of - (of * used).sum(axis=0) / count) * used for of in (x, y))
+    xx, yy, xy = ((a * b).sum(axis=0) for a, b in ((x, x), (y, y), (x, y)))
     return information_from_scatter(count, xx, xy, yy, config)
 
 

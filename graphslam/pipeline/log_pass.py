@@ -1,7 +1,7 @@
 """What one pass over a log accumulates, whatever it does with the messages."""
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -25,7 +25,7 @@ from graphslam.pipeline.progress import Progress, counted, timed
 from graphslam.pipeline.recorded_closures import RecordedClosures
 from graphslam.pipeline.robot_settings import make_tracks, with_noted_keyframes
 from graphslam.pipeline.robot_state import RobotState
-from graphslam.pipeline.scan_evidence import ScanEvidence
+from graphslam.pipeline.scan_evidence import Parked
 from graphslam.pipeline.scans_since_keyframe import ScansSinceKeyframe
 
 
@@ -55,7 +55,7 @@ class LogPass:
     number of a step -> what its sightings of robots could be, used or not. ``rejected`` counts
     observations and ``removed_returns`` returns that were not used, by reason; ``innovations``:
     model -> (time, squared distance per degree of freedom) of accepted observations.
-    ``scan_evidence``: what scans say of the robots' paths, where it has been asked already.
+    ``parked``: when robots stood (`find_parked`), where that has been asked already.
     """
 
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
@@ -88,7 +88,7 @@ class LogPass:
         self.offers: dict[int, tuple[Association, ...]] = {}
         self.keyframe_scans: list[KeyframeScan] = []
         self.map_doubt = ""  # of where it was placed in a known map
-        self.scan_evidence: Mapping[str, ScanEvidence] = {}
+        self.parked: Mapping[str, Sequence[Parked]] | None = None
         #: landmarks that were moved: number -> the landmark that they were before
         self.moved: Mapping[int, int] = {}
         #: of visits, from where their walls of the building were seen before

@@ -4,7 +4,7 @@ They are compared with each other, so it hardly matters which estimate of the pa
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -49,28 +49,6 @@ class Parked(NamedTuple):
     speed_m_s: float = 0.0
 
 
-class ScanEvidence(NamedTuple):
-    """When a robot stood, by odometry; how scans fit if its path was another one along walls."""
-
-    parked: tuple[Parked, ...]
-    along_walls: PathMisfits
-
-
-def gather_scan_evidence(
-    pipeline: "LogPass", estimate: Estimate, parked: Mapping[str, Sequence[Parked]] | None = None
-) -> dict[str, ScanEvidence]:
-    """What every robot's scans say; ``estimate`` is of the states that they were made from.
-
-    At most some hundred scans of each robot are looked at, however long the log is. ``parked``:
-    what `find_parked` gave, where it has been asked already.
-    """
-    stood = find_parked(pipeline) if parked is None else parked
-    return {
-        name: ScanEvidence(tuple(stood[name]), _along_walls(pipeline, name, estimate))
-        for name in pipeline.started
-    }
-
-
 def find_parked(pipeline: "LogPass") -> dict[str, Sequence[Parked]]:
     """When each robot stood by its odometry, and how its scans changed; no estimate is needed."""
     return {name: tuple(_parked(pipeline, name, run)) for name, run in pipeline.started.items()}
@@ -101,12 +79,18 @@ def _parked(pipeline: "LogPass", name: str, run: RobotState) -> Iterator[Parked]
         yield Parked(begin, end, max(changes, default=0.0), half, speed)
 
 
-def _along_walls(pipeline: "LogPass", name: str, estimate: Estimate) -> PathMisfits:
-    """Nothing to doubt where all motion is that of the scans."""
-    if name in pipeline.log.without_odometry:
-        return NO_PATH
-    scans = [scan for scan in pipeline.keyframe_scans if scan.robot == name]
-    return path_misfits(scans, estimate.states[name])
+def misfits_along_walls(pipeline: "LogPass", estimate: Estimate) -> dict[str, PathMisfits]:
+    """How every robot's scans fit if its path was another one along walls.
+
+    At most some hundred scans of each robot are looked at, however long the log is. There is
+    nothing to doubt where all motion is that of the scans. ``estimate``: of the states.
+    """
+    found = dict.fromkeys(pipeline.started, NO_PATH)
+    for name in found:
+        if name not in pipeline.log.without_odometry:
+            scans = [scan for scan in pipeline.keyframe_scans if scan.robot == name]
+            found[name] = path_misfits(scans, estimate.states[name])
+    return found
 
 
 def _half_changed(before: Array, after: Array) -> float:

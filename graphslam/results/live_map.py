@@ -30,8 +30,11 @@ _SCANS, _LANDMARKS, _ELLIPSES = "scans", "landmarks", "95 % ellipses"
 _CLOSURES, _CAUSAL = "loop closures", "causal"
 
 
-def live_map(result: Result) -> LiveFigure:
-    """The figure; robots in their colours, everything at the time at which it was seen."""
+def live_map(result: Result, limits: Array) -> LiveFigure:
+    """The figure; robots in their colours, everything at the time at which it was seen.
+
+    ``limits``: [[x_min, x_max], [y_min, y_max]], m, see `report_maps.Overview`.
+    """
     robots = sorted(result.robots)
     stamps = [result.robots[name].final.stamps_ns for name in robots]
     start_ns, end_ns = int(min(s[0] for s in stamps)), int(max(s[-1] for s in stamps))
@@ -49,7 +52,7 @@ def live_map(result: Result) -> LiveFigure:
         "map", "Interactive map.",
         f"Drag to move; click, then turn the wheel to zoom; point at {what} for their numbers. "
         "Swipe from the result to odometry alone; replay the drive. Ellipses are to scale.",
-        "map", maps.result_limits(result), series, layers,
+        "map", limits, series, layers,
         duration_s=(end_ns - start_ns) / 1e9, in_minutes=clock.in_minutes,
         sides=("odometry alone", "result"),
         scans=_scans(result, robots, clock) if result.keyframe_scans else None,

@@ -1,6 +1,7 @@
 """Maps of a result: scans, trajectories with uncertainty, landmarks with their numbers."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,7 +30,26 @@ def poses_at(trajectory: Trajectory, stamps_ns: Sequence[int]) -> Array:
     return interpolate(trajectory.poses[before], trajectory.poses[after], share)
 
 
-def overview(result: Result, height_in: float, *, dead_reckoning: bool) -> str:
+@dataclass(frozen=True, slots=True, eq=False)
+class Overview:
+    """What a map of all shows: ``paths`` and ``clouds`` (n, 2) of robots, ``landmarks``, limits.
+
+    ``limits``: [[x_min, x_max], [y_min, y_max]] of paths and scans, or of paths and landmarks, m.
+    """
+
+    paths: Mapping[str, Trajectory]
+    clouds: Mapping[str, Array]
+    landmarks: Sequence[Landmark]
+    limits: Array
+
+    @property
+    def height_in(self) -> float:
+        """Height of the maps, inches: in proportion to the extent, within limits."""
+        (x0, x1), (y0, y1) = self.limits
+        return WIDTH_IN * float(np.clip((y1 - y0) / (x1 - x0), 0.6, 1.15))
+
+
+def overview_of(result: Result, *, dead_reckoning: bool = False) -> Overview:
     """All scans and paths on the final trajectory, or on odometry alone.
 
     Without scans the final trajectory is shown with the landmarks.
@@ -42,21 +62,25 @@ def overview(result: Result, height_in: float, *, dead_reckoning: bool) -> str:
     landmarks = () if result.keyframe_scans or dead_reckoning else result.landmarks
     extents = [landmark.extent for landmark in landmarks]
     whole = [*(path.poses[:, :2] for path in paths.values()), *extents]
-    limits = _limits(whole, clouds.values())
+    return Overview(paths, clouds, landmarks, _limits(whole, clouds.values()))
+
+
+def overview_map(shown: Overview, height_in: float, of: str) -> str:
+    """The map of an overview ``of`` this trajectory."""
+    paths, limits = shown.paths, shown.limits
 
     def draw(drawing: Drawing) -> None:
         axes = map_axes(drawing, limits)
-        for i, cloud in enumerate(clouds.values()):
+        for i, cloud in enumerate(shown.clouds.values()):
             if len(cloud):
                 axes.image(density(cloud, limits, robot_color(i)), limits)
         several = len(paths) > 1
         for i, (name, path) in enumerate(paths.items()):
             style = Style(robot_color(i) if several else ACCENT, 0.9, dashes=robot_dashes(i))
             axes.path(path.poses[:, :2], style, name if several else None)
-        _draw_landmarks(axes, landmarks, 1.0)
+        _draw_landmarks(axes, shown.landmarks, 1.0)
 
-    what = "odometry alone" if dead_reckoning else "the final trajectory"
-    return svg(f"Scans and paths on {what}", height_in, draw)
+    return svg(f"Scans and paths on {of}", height_in, draw)
 
 
 def landmark_map(result: Result, height_in: float) -> tuple[str, int]:
@@ -120,20 +144,6 @@ def worst_sigma(covs: Array) -> Array:
     """
     a, b, c = covs[:, 0, 0], covs[:, 0, 1], covs[:, 1, 1]
     return np.asarray(np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0)))
-
-
-def result_limits(result: Result) -> Array:
-    """[[x_min, x_max], [y_min, y_max]] of paths and scans, or of paths and landmarks, m."""
-    paths = [robot.final.poses[:, :2] for robot in result.robots.values()]
-    clouds = [_cloud(result, name, r.final, False) for name, r in result.robots.items()]
-    extents = [] if result.keyframe_scans else [m.extent for m in result.landmarks]
-    return _limits([*paths, *extents], clouds)
-
-
-def map_height(result: Result) -> float:
-    """Height of the maps of a result, inches: in proportion to its extent, within limits."""
-    (x0, x1), (y0, y1) = result_limits(result)
-    return WIDTH_IN * float(np.clip((y1 - y0) / (x1 - x0), 0.6, 1.15))
 
 
 def _cloud(result: Result, robot: str, path: Trajectory, dead_reckoning: bool) -> Array:

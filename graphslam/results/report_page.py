@@ -68,15 +68,16 @@ def _map_section(result: Result) -> str:
     scans = bool(result.keyframe_scans)
     what = "Superposed scans" if scans else "Paths"
     landmark_note = "" if scans else " Triangles are landmarks."
-    height_in = maps.map_height(result)
+    final, by_odometry = maps.overview_of(result), maps.overview_of(result, dead_reckoning=True)
+    height_in = final.height_in
     figures = [
         html.figure(
-            maps.overview(result, height_in, dead_reckoning=False),
+            maps.overview_map(final, height_in, "the final trajectory"),
             "Final trajectory.",
             f"{what} on the trajectory from all data.{landmark_note}",
         ),
         html.figure(
-            maps.overview(result, height_in, dead_reckoning=True),
+            maps.overview_map(by_odometry, height_in, "odometry alone"),
             "Dead reckoning.",
             f"The same {'scans' if scans else 'paths'} by odometry alone.",
         ),
@@ -104,7 +105,9 @@ def _map_section(result: Result) -> str:
             + ("; the faint line is the causal estimate." if _has_causal(result) else "."),
         )
     )
-    return html.section("Map", live_html(live_map(result)) + html.figure_grid(figures))
+    return html.section(
+        "Map", live_html(live_map(result, final.limits)) + html.figure_grid(figures)
+    )
 
 
 def _sessions_section(summary: Mapping[str, Any]) -> str:

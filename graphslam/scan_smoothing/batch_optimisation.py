@@ -53,7 +53,7 @@ from graphslam.mapping.redundant_closures import closures_not_in_landmarks
 from graphslam.mapping.visits import tie_visits
 from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.log_pass import timed
-from graphslam.pipeline.scan_evidence import find_parked, gather_scan_evidence
+from graphslam.pipeline.scan_evidence import find_parked
 from graphslam.scan_smoothing.path_closing import ClosedPaths, close_paths
 from graphslam.scan_smoothing.reoptimise_scans import add_mount_bias, with_closures
 from graphslam.scan_smoothing.scan_refinement import refine_motions
@@ -238,7 +238,7 @@ def _solved(
     # once landmarks of different visits are tied, most closures are no longer needed
     closures = closures_not_in_landmarks(closures, paths.spans, steps, landmarks)
     counts["closures_kept"] = len(closures)
-    parked = find_parked(scan_log)
+    scan_log.parked = find_parked(scan_log)
     landmarks.update_from(steps, found)
     more = with_loose_returns(
         steps, found, scan_log.keyframe_scans, landmarks.entries, config.front_end
@@ -262,8 +262,6 @@ def _solved(
     add_mount_bias(estimate, tracks)
     for name in tracks:
         scan_log.runs[name].is_calibrated = config.odometry.calibrate
-    # what the second process does meanwhile moves the estimate by far less than scans can tell
-    scan_log.scan_evidence = gather_scan_evidence(scan_log, estimate, parked)
     if minimum:
         estimate = moved_to(minimum.result(), estimate)
     # the minimum may have turned the map as a whole: ends of walls are where they are seen there

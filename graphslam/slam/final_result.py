@@ -19,14 +19,17 @@ from graphslam.mapping.landmark_records import make_landmarks
 from graphslam.odometry.mount_covariance import with_mount_errors
 from graphslam.pipeline.findings import FinishedPass
 from graphslam.pipeline.log_pass import LogPass, timed
+from graphslam.pipeline.path_evidence import MOST_SCANS, PathMisfits
+from graphslam.pipeline.scan_evidence import misfits_along_walls
 from graphslam.pipeline.scans_between import walls_of_frames
 from graphslam.slam.retirement import retired_landmarks
 from graphslam.slam.summary import summarise
 from graphslam.verdict.evidence import gather
 from graphslam.verdict.verdict import judge
 
-#: ms that a factor of the graph takes for its error, and a pose with its covariance for all results
-FACTOR_MS, POSE_MS = 0.004, 0.006
+#: ms that a factor of the graph takes for its error, a pose with its covariance for all results,
+#: and a scan that is compared with another for what it says of the path
+FACTOR_MS, POSE_MS, SCAN_MS = 0.004, 0.006, 0.2
 #: scans that a result keeps for pictures, at most
 MAX_PICTURES = 4000
 
@@ -42,14 +45,11 @@ def make_result(finished: FinishedPass, began: float) -> Result:
     with timed(pipeline.seconds, "trajectories"):
         final = _in_own_frames(finished)
         # in the second process, while the trajectories are made
-        factors = sum(len(step.motions) + len(step.associations) for step in final.steps)
-        errors = Future(
-            partial(graph_error, final.steps, final.estimate, pipeline.kernel),
-            about_ms=FACTOR_MS * factors,
-        )
+        task = partial(_errors_and_misfits, pipeline, final)
+        meanwhile = Future(task, about_ms=_about_ms(pipeline, final))
         final = _with_mount_errors(final, pipeline)
         robots = _robot_results(finished, final)
-        error, plain = errors.result()
+        error, plain, along_walls = meanwhile.result()
         estimate = replace(final.estimate, error=error)
     landmarks = pipeline.frames.label_landmarks(
         make_landmarks(final.landmarks, estimate), pipeline.landmarks.entries.values()
@@ -67,7 +67,7 @@ def make_result(finished: FinishedPass, began: float) -> Result:
     summary = summarise(pipeline, estimate, plain, len(landmarks), finished.findings.clocks)
     if "known_map" in summary:
         summary["known_map"]["retired"] = list(retired.values())
-    evidence = gather(pipeline, robots, final.steps, estimate, innovations, summary)
+    evidence = gather(pipeline, robots, final.steps, estimate, innovations, summary, along_walls)
     summary["verdict"] = judge(evidence)
     return Result(
         robots,
@@ -93,6 +93,21 @@ class _Final:
     steps: tuple[Step, ...]
     landmarks: LandmarkMap
     frames: Mapping[int, str]
+
+
+def _errors_and_misfits(
+    pipeline: LogPass, final: _Final
+) -> tuple[float, float, dict[str, PathMisfits]]:
+    """The error of the graph with kernels and without, and how scans fit along robots' paths."""
+    errors = graph_error(final.steps, final.estimate, pipeline.kernel)
+    return *errors, misfits_along_walls(pipeline, final.estimate)
+
+
+def _about_ms(pipeline: LogPass, final: _Final) -> float:
+    """How long `_errors_and_misfits` takes."""
+    factors = sum(len(step.motions) + len(step.associations) for step in final.steps)
+    scans = min(len(pipeline.keyframe_scans), MOST_SCANS)
+    return FACTOR_MS * factors + SCAN_MS * scans
 
 
 def _in_own_frames(finished: FinishedPass) -> _Final:

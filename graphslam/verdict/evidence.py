@@ -21,7 +21,7 @@ from graphslam.odometry.missing_increments import MissingIncrements
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.pipeline.path_evidence import NO_PATH, PathMisfits
 from graphslam.pipeline.robot_state import RobotState
-from graphslam.pipeline.scan_evidence import Parked, gather_scan_evidence
+from graphslam.pipeline.scan_evidence import Parked, find_parked
 from graphslam.verdict.curved_walls import curved_share
 from graphslam.verdict.sweep_skew import NO_SKEW, SweepSkew, by_robot, sweep_skew
 from graphslam.verdict.told_starts import ToldStart, told_starts
@@ -147,13 +147,17 @@ def gather(
     estimate: Estimate,
     innovations: Mapping[str, Array],
     summary: Mapping[str, Any],
+    along_walls: Mapping[str, PathMisfits],
 ) -> Evidence:
-    """The evidence of a run: the last pass, and its result, see `graphslam.core.records.Result`."""
+    """The evidence of a run: the last pass, and its result, see `graphslam.core.records.Result`.
+
+    ``along_walls``: robot -> what `misfits_along_walls` found.
+    """
     found = []
     entries = pipeline.landmarks.entries.items()
     identities: dict[int | str, str] = {i: one.identity or "" for i, one in entries}
     scans = by_robot(pipeline.keyframe_scans)
-    by_scans = pipeline.scan_evidence or gather_scan_evidence(pipeline, estimate)
+    parked = find_parked(pipeline) if pipeline.parked is None else pipeline.parked
     for name, run in pipeline.started.items():
         motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
         own = [a for step in steps for a in step.associations if a.robot == name]
@@ -176,8 +180,8 @@ def gather(
                 motions_ns=np.array([time for time, _ in motions], dtype=np.int64),
                 contradicted=np.array([was for _, was in motions], dtype=bool),
                 seen=_seen(seen, run, estimate, identities),
-                parked=by_scans[name].parked,
-                along_walls=by_scans[name].along_walls,
+                parked=tuple(parked[name]),
+                along_walls=along_walls[name],
                 bridged_sigma_m=run.track.bridged_sigma_m,
                 lost_ns=np.array(run.lost, dtype=np.int64).reshape(-1, 2),
                 curved=curved_share(own),

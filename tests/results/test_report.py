@@ -32,7 +32,7 @@ from graphslam.results.live_map import live_map
 from graphslam.results.live_paths import _followed
 from graphslam.results.report import render
 from graphslam.results.report_figure import Drawing, density, map_axes
-from graphslam.results.report_maps import poses_at, trajectory_map
+from graphslam.results.report_maps import overview_of, poses_at, trajectory_map
 from graphslam.results.report_tables import headline, landmark_sigma, number
 
 
@@ -420,7 +420,8 @@ def test_paths_of_the_map_that_moves_cut_no_corners(count):
     robot = result.robots["robot1"]
     long = dataclasses.replace(robot, final=path, causal=path, dead_reckoning=path)
     robots = {f"r{k:02}": long for k in range(count)}
-    figure = live_map(dataclasses.replace(result, robots=robots, steps=()))
+    result = dataclasses.replace(result, robots=robots, steps=())
+    figure = live_map(result, overview_of(result).limits)
     drawn = [one.columns for one in figure.series if one.glyph == "path"]
     assert len(drawn) == 3 * count
     for columns in drawn:
@@ -449,7 +450,7 @@ def test_a_name_in_the_legend_of_a_map_is_of_one_robot():
     result, _, _ = orchard(keyframes=30, trees=9)
     robots = {f"r{k:02}": result.robots["robot1"] for k in range(36)}
     many = dataclasses.replace(result, robots=robots, steps=())
-    figure = live_map(many)
+    figure = live_map(many, overview_of(many).limits)
     drawn = [one for one in figure.series if one.glyph == "path" and one.layer in robots]
     looks = {(one.layer, one.color, str(one.dash)) for one in drawn}
     assert len(looks) == len({look[1:] for look in looks}) == 36
@@ -470,7 +471,8 @@ def test_the_map_holds_the_whole_path_and_ellipses_that_are_apart():
     poses[1234, :2] += 50.0
     final = Trajectory(stamps, poses, np.repeat(robot.final.covs, 100, axis=0))
     long = dataclasses.replace(robot, final=final, causal=None, dead_reckoning=final)
-    figure = live_map(dataclasses.replace(result, robots={**result.robots, "robot1": long}))
+    result = dataclasses.replace(result, robots={**result.robots, "robot1": long})
+    figure = live_map(result, overview_of(result).limits)
     assert (figure.limits[:, 1] > poses[1234, :2]).all()
     (ellipses,) = (one.columns for one in figure.series if one.glyph == "ellipses")
     at = np.column_stack([ellipses["x"], ellipses["y"]])
