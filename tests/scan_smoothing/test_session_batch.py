@@ -139,9 +139,10 @@ def test_furniture_that_was_pushed_alike_drags_no_session(tmp_path, push_m):
 
 def test_a_session_lies_on_the_walls_and_not_on_what_was_pushed_alike(tmp_path):
     """All furniture of the lab was pushed by 25 cm: it lay on itself, each wall of the room stood
-    twice, and the second day was 25 cm off, with a good verdict (seed 2)."""
+    twice, and the second day was 25 cm off, with a good verdict (seed 2). Then it was right, but
+    doubtful (seed 0): places were counted that contradict where it had been laid before."""
     push_m = np.array([0.22, 0.12])
-    days = [lab(tmp_path / f"day{n}.mcap", n * push_m, seed=4 + n) for n in range(2)]
+    days = [lab(tmp_path / f"day{n}.mcap", n * push_m, seed=n) for n in range(2)]
     truth = read_truth(days, SAME_PLACE).trajectories
     told = {f"start.poses.{name}": path.poses[0].tolist() for name, path in truth.items()}
     result = graphslam.smooth(days, config=SAME_PLACE, **told)
@@ -152,7 +153,7 @@ def test_a_session_lies_on_the_walls_and_not_on_what_was_pushed_alike(tmp_path):
     )
     # biases of surfaces are 1 cm: where nothing was pushed up to 2 cm are left
     assert np.hypot(*(second - first)[:2]) < 0.03
-    assert "twice" not in str(result.summary["verdict"])
+    assert result.summary["verdict"]["verdict"] == "good", result.summary["verdict"]
 
 
 def lab(path, push_m, seed):
