@@ -3,11 +3,13 @@
 Intel: the log's thirds are joined without a word about where the second and the third begin; the
 relations are those between all scans, also of different thirds. Office: every day the robot starts
 elsewhere on its round, furniture in the corridors has moved, and on the third day a wall has been
-built. The start of the first day is told, with an error drawn from its prior, so that the world is
-that of the truth; those of the others are found. Errors are of all days together, in the world, not
-aligned, of the days that are in one frame with the first. NEES is of all their poses together, with
-its 99 % bounds under the stated joint covariance, and its mean with those of all seeds together.
-Timed is the CPU time.
+built. Biases of surfaces are drawn once for all days of a seed, as they are the building's. The
+start of the first day is told, with an error drawn from its prior, so that the world is that of the
+truth; those of the others are found. Errors are of all days together, in the world, not aligned, of
+the days that are in one frame with the first. NEES is of all their poses together, with its 99 %
+bounds under the stated joint covariance, and its mean with those of all seeds together. Of the
+changes from one day to the next those are false that are not near what changed. Timed is the CPU
+time.
 
 Run: python benchmarks/sessions.py [intel] [office] [--seeds N] [--first SEED]
 """
@@ -15,7 +17,7 @@ Run: python benchmarks/sessions.py [intel] [office] [--seeds N] [--first SEED]
 import os
 import struct
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -24,14 +26,17 @@ from typing import Any
 import numpy as np
 from common import FREIBURG, parser, pooled_bounds
 from mcap.reader import make_reader
+from scipy.spatial import cKDTree
 
 import graphslam
+from graphslam.core.geometry import Array, unit_vectors
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.relation_metrics import read_relations
 from graphslam.importers import IMPORTERS
 from graphslam.logs import LogWriter, read_truth, schemas
 from graphslam.simulation import load_scenario, simulate
 from graphslam.simulation.scenario import Leg, Scenario, Wall
+from graphslam.simulation.world import Outline, outlines_of
 
 SAME_PLACE = graphslam.load_config(**{"logs.same_place": True})
 DAYS, DAY_S = 5, 86_400
@@ -54,6 +59,8 @@ STAMPED = (schemas.LASER_SCAN, schemas.ODOMETRY, schemas.JOINT_STATE, schemas.TR
 START_SIGMA = (0.002, 0.002, 0.0002)
 #: m: a day whose mean error is larger is joined at a wrong place
 WRONG_M = 0.5
+#: m: half of what a change shows lies nearer to something that changed, or it is a false one
+NEAR_M = 0.2
 #: built on the third day, in front of the doors of a room
 BUILT = Wall("built", ((14.0, 18.85), (17.5, 18.85)))
 
@@ -109,6 +116,7 @@ def cut(log: Path, folder: Path, parts: int) -> Iterator[Path]:
 def office(folder: Path, seeds: Iterable[int]) -> Iterator[str]:
     """A line for each seed, and one for all."""
     errors, nees, poses, found, refused, wrong, seconds = [], [], [], 0, 0, 0, []
+    changes, doubtful = np.zeros(2, dtype=np.int64), 0
     bounds: list[Any] = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -136,10 +144,15 @@ def office(folder: Path, seeds: Iterable[int]) -> Iterator[str]:
         nees.append(joint["nees_per_dof"])
         bounds.append(joint["nees_bounds_99"])
         poses.append(joint["effective_poses"])
+        now = np.array(told_changes(result.summary["sessions"]["changes"], seed))
+        changes += now
+        said = [reason["text"] for reason in result.summary["verdict"]["reasons"]]
+        doubtful += result.summary["verdict"]["verdict"] != "good"
         yield (
             f"office, seed {seed}: of {len(others)} days {len(together)} joined, {len(off)} wrong; "
             f"ATE {errors[-1]:.4f} m, aligned {joint['ate_aligned_rmse_m']:.4f} m, NEES/dof "
-            f"{nees[-1]:.2f} in {bounds[-1][0]:.2f} to {bounds[-1][1]:.2f}; {seconds[-1]:.0f} CPU s"
+            f"{nees[-1]:.2f} in {bounds[-1][0]:.2f} to {bounds[-1][1]:.2f}; {now.sum()} changes, "
+            f"{now[1]} false; {seconds[-1]:.0f} CPU s; {'; '.join(said) or 'good'}"
         )
     low, high = np.array(bounds).T
     least, most = pooled_bounds(poses)
@@ -149,8 +162,41 @@ def office(folder: Path, seeds: Iterable[int]) -> Iterator[str]:
         f"{np.mean(nees):.2f} in {least:.2f} to {most:.2f}, single ones {np.min(nees):.2f} "
         f"to {np.max(nees):.2f}, "
         f"{np.sum(np.array(nees) > high)} above and {np.sum(np.array(nees) < low)} below their "
-        f"99 % bounds; {np.mean(seconds):.0f} CPU s"
+        f"99 % bounds; {changes.sum()} changes, {changes[1]} false; {doubtful} doubtful; "
+        f"{np.mean(seconds):.0f} CPU s"
     )
+
+
+def told_changes(since: Sequence[Mapping[str, Any]], seed: int) -> tuple[int, int]:
+    """How many entries of ``sessions.changes`` are of what changed, and how many are false."""
+    counts = [0, 0]
+    for entry in since:
+        days = [int(entry[key].removeprefix("day")) for key in ("since", "session")]
+        there = cKDTree(np.concatenate(list(changed_surfaces(seed, *days))))
+        for change in entry["changes"]:
+            off_m, _ = there.query(np.array(change["polygon"]))
+            counts[bool(np.median(off_m) > NEAR_M)] += 1
+    return counts[0], counts[1]
+
+
+def changed_surfaces(seed: int, before: int, later: int) -> Iterator[Array]:
+    """Points (n, 2) on what stands there on one of two days only, m."""
+    scenario = load_scenario("office-loop")
+    worlds = [
+        {one.name: one for one in outlines_of(changed(scenario, seed, number).world)}
+        for number in (before, later)
+    ]
+    for these, others in (worlds, worlds[::-1]):
+        for name, one in these.items():
+            if name not in others or not np.array_equal(one.points, others[name].points):
+                yield surface(one)
+
+
+def surface(one: Outline) -> Array:
+    """Points (n, 2) on an outline, m, near each other."""
+    if one.radius_m:
+        return one.points + one.radius_m * unit_vectors(np.linspace(0.0, 2 * np.pi, 60))
+    return np.concatenate([np.linspace(*face, 200) for face in one.faces])
 
 
 def day(folder: Path, seed: int, number: int) -> Path:
@@ -173,7 +219,7 @@ def day(folder: Path, seed: int, number: int) -> Path:
     made = replace(changed(scenario, seed, number), robots={"robot": robot})
     path = folder / f"day{number}.mcap"
     path.unlink(missing_ok=True)
-    simulate(made, folder / "now.mcap", 100 * seed + number)
+    simulate(made, folder / "now.mcap", 100 * seed + number, materials_seed=seed)
     later(folder / "now.mcap", path, DAY_S * number)
     (folder / "now.mcap").unlink()
     return path

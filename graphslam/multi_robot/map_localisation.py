@@ -112,10 +112,17 @@ def hypotheses(known: PlaceMap, own: PlaceMap, config: MultiRobotConfig) -> list
     return made + [Hypothesis(pose, made[0].cov) for pose in others]
 
 
-def support(known: Sequence[SubmapPose], places: Sequence[SubmapPose]) -> Support:
-    """How well places (n), laid into the map as a hypothesis says, agree with its places."""
+def support(
+    known: Sequence[SubmapPose], places: Sequence[SubmapPose], pushed: Sequence[Array] = ()
+) -> Support:
+    """How well places (n), laid into the map as a hypothesis says, agree with its places.
+
+    ``pushed``: motions (2,) m in the world by which much was pushed alike since. What lies on
+    something if one of them is undone contradicts nothing; the places lie where they are laid.
+    """
     n = len(places)
-    beside, same, absent = _agreements(known, places, np.ones((n, len(known)), dtype=bool))
+    every = np.ones((n, len(known)), dtype=bool)
+    beside, same, absent = _agreements(known, places, every, pushed)
     confirmed, of_all = np.zeros(n, dtype=bool), np.zeros((2, n))
     confirmed[beside] = same >= MIN_CONFIRMED
     of_all[:, beside] = same, absent
@@ -139,16 +146,21 @@ def self_contradictions(places: Sequence[SubmapPose], apart_m: float) -> Array:
 
 
 def _agreements(
-    known: Sequence[SubmapPose], places: Sequence[SubmapPose], allowed: BoolArray
+    known: Sequence[SubmapPose],
+    places: Sequence[SubmapPose],
+    allowed: BoolArray,
+    pushed: Sequence[Array] = (),
 ) -> tuple[list[int], Array, Array]:
     """Which places lie among known ones, m of them, and the shares (m,) of `_agreement`.
 
-    ``allowed`` (n, number of ``known``): which of these a place is compared with.
+    ``allowed`` (n, number of ``known``): which of these a place is compared with. ``pushed`` as in
+    `support`: then places are not aligned, as that would lay them on what was pushed.
     """
     positions = np.array([p.pose[:2] for p in known]).reshape(-1, 2)
     beside: list[int] = []
     around: list[Submap] = []
     guesses: list[Array] = []
+    undone: list[list[Array]] = []
     for k, place in enumerate(places):
         distance = np.where(allowed[k], np.hypot(*(positions - place.pose[:2]).T), np.inf)
         nearest = int(distance.argmin()) if len(distance) else 0
@@ -158,14 +170,17 @@ def _agreements(
             near = np.flatnonzero(distance < AROUND_M).tolist()
             around.append(surroundings([known[j] for j in near], origin))
             guesses.append(between(origin, place.pose))
-    aligned, _, _ = align_pairs([places[k].submap for k in beside], around, guesses)
+            undone.append([between(origin, place.pose - np.append(by, 0.0)) for by in pushed])
+    aligned = np.array(guesses).reshape(-1, 3)
+    if not pushed:
+        aligned, _, _ = align_pairs([places[k].submap for k in beside], around, guesses)
     shares = np.zeros((2, len(beside)))
     for n, (k, target, guess, pose) in enumerate(
         zip(beside, around, guesses, aligned, strict=True)
     ):
         off = between(guess, pose)
         at = pose if np.hypot(off[0], off[1]) < OFF_M and abs(off[2]) < OFF_RAD else guess
-        shares[:, n] = _agreement(places[k].submap, target, at)
+        shares[:, n] = _agreement(places[k].submap, target, [at, *undone[n]])
     return beside, shares[0], shares[1]
 
 
@@ -176,15 +191,25 @@ def surroundings(places: Sequence[SubmapPose], origin: Array) -> Submap:
     return make_submap(np.concatenate(poses), clouds, places[0].submap.config)
 
 
-def _agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float]:
+def _agreement(source: Submap, target: Submap, poses: Sequence[Array]) -> tuple[float, float]:
     """Share of the points of ``source`` that the target confirms, and that contradict free space.
 
-    The latter also of the points of the target that the source saw; it is in no way complete.
+    The latter also of the points of the target that the source saw; it is in no way complete. Of
+    ``poses`` the first one is where the source lies; what others confirm contradicts nothing.
     """
-    confirmed, free = compare_with_scans(transform(pose, source.points), target)
-    same, absent = int(confirmed.sum()), int((free & ~confirmed).sum())
-    seen, through = compare_with_scans(transform(inverse(pose), target.points), source)
-    missing = int((through & ~seen).sum())
-    visible = int(seen.sum()) + missing
     n = len(source.points)
-    return same / n, max(absent / n, missing / max(visible, 1))
+    same, _, absent = _compared([transform(pose, source.points) for pose in poses], target)
+    back = [transform(inverse(pose), target.points) for pose in poses]
+    _, seen, missing = _compared(back, source)
+    return same / n, max(absent / n, missing / max(seen + missing, 1))
+
+
+def _compared(points: Sequence[Array], submap: Submap) -> tuple[int, int, int]:
+    """How many points (n, 2) a submap confirms where they lie first, and at any of some places.
+
+    The last number is of those that it does not, and that lie in its free space at first.
+    """
+    found = [compare_with_scans(at, submap) for at in points]
+    first, free = found[0]
+    confirmed = np.logical_or.reduce([at for at, _ in found])
+    return int(first.sum()), int(confirmed.sum()), int((free & ~confirmed).sum())

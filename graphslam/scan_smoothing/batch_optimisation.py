@@ -55,6 +55,7 @@ from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.log_pass import timed
 from graphslam.pipeline.scan_evidence import find_parked
 from graphslam.scan_smoothing.path_closing import ClosedPaths, close_paths
+from graphslam.scan_smoothing.placement_doubts import doubt_again
 from graphslam.scan_smoothing.reoptimise_scans import add_mount_bias, with_closures
 from graphslam.scan_smoothing.scan_refinement import refine_motions
 from graphslam.scan_smoothing.scan_tracking import TrackedLog
@@ -267,6 +268,8 @@ def _solved(
     # the minimum may have turned the map as a whole: ends of walls are where they are seen there
     landmarks.update_from(steps, estimate)
     scan_log.displacements = displacements(steps, estimate, landmarks)
+    if paths.by:
+        doubt_again(scan_log, estimate.states, paths.by)
     return estimate, steps
 
 

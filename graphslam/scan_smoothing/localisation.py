@@ -13,7 +13,7 @@ from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
 from graphslam.core.gaussian import chi2_quantile, symmetric
-from graphslam.core.geometry import between, compose, compose_cov, inverse, wrap
+from graphslam.core.geometry import Array, between, compose, compose_cov, inverse, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Start
 from graphslam.core.suggestions import start_option
@@ -26,7 +26,7 @@ from graphslam.multi_robot.place_recognition import PlaceMap, seen_extent
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.pipeline.log_pass import timed
 from graphslam.scan_smoothing.path_closing import PLACE_COV, ClosedPaths, close_paths
-from graphslam.scan_smoothing.scan_tracking import ScanLog
+from graphslam.scan_smoothing.scan_tracking import ScanLog, TrackedLog
 
 #: chi-square of three degrees of freedom at 99.9 %
 START_GATE = float(chi2_quantile(0.999, 3))
@@ -63,7 +63,7 @@ def is_start_given(config: Config, robot: str) -> bool:
     return config.start.from_truth or robot in config.start.poses
 
 
-def given_start(scan_log: ScanLog, robot: str) -> Start:
+def given_start(scan_log: TrackedLog, robot: str) -> Start:
     """Of the first state, which is the sensor's; given is that of the base."""
     told = scan_log.known.frame_assignment.starts[robot]
     track = scan_log.runs[robot].track
@@ -95,9 +95,7 @@ def start_as_given(
     placed, places = check_given(scan_log, robot, laid, known_map)
     said = doubt(placed, places, scan_log.config.loop_closure)
     if is_wrong:
-        off = between(given.pose, laid.states[robot].poses[0])
-        what = f"{np.hypot(off[0], off[1]):.2f} m and {np.degrees(abs(off[2])):.1f}°"
-        wrong = f"the start that was told is {what} from where the map has it, and was not used"
+        wrong = told_elsewhere(given, laid.states[robot].poses[0])
         said = f"{wrong}; {said}" if said else wrong
     if not placed.confirmed.any():
         said = "no place of it is recognised; the log is where its start was told to be"
@@ -117,6 +115,13 @@ def is_contradicted(given: Start, laid: ClosedPaths, robot: str) -> bool:
     # along axes in which the map tells nothing there is nothing left, and nothing off
     told = values > LEAST_TOLD * np.diag(given.cov).min()
     return bool(((axes.T @ off)[told] ** 2 / values[told]).sum() > START_GATE)
+
+
+def told_elsewhere(given: Start, pose: Array) -> str:
+    """What is to be said of a start that was given, but lies at a ``pose`` (3,)."""
+    off = between(given.pose, pose)
+    what = f"{np.hypot(off[0], off[1]):.2f} m and {np.degrees(abs(off[2])):.1f}°"
+    return f"the start that was told is {what} from where the map has it, and was not used"
 
 
 def check_given(

@@ -1,7 +1,7 @@
 """Tracked paths whose loops are closed on a pose graph of submaps, and what it says about them."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class ClosedPaths:
     robot was around there. ``graph`` is that of the submaps, ``times`` and ``first``: robot ->
     times of its nodes in it, and the number of the first. ``places`` are the nodes of a known map,
     ``known`` the numbers of its landmarks; ``to_map``: how many closures are with its places.
+    ``by``: robot -> (2,) m, by how much a path is `displaced` since its loops were closed.
     """
 
     states: Mapping[str, Trajectory]
@@ -46,6 +47,7 @@ class ClosedPaths:
     places: IntArray
     known: Collection[int] = ()
     to_map: int = 0
+    by: Mapping[str, Array] = field(default_factory=dict)
 
     def node(self, robot: str, time_ns: int) -> int:
         """The node of the graph that was passed last at a time."""
@@ -71,7 +73,8 @@ class ClosedPaths:
             c for c in self.closures
             if np.hypot(*(by.get(c.robot, stays) - by.get(c.other, stays))) < ON_M
         ]  # fmt: skip
-        return replace(self, states=moved, closures=kept)
+        so_far = {**self.by, **{name: self.by.get(name, stays) + off for name, off in by.items()}}
+        return replace(self, states=moved, closures=kept, by=so_far)
 
     def uncertainty(self, steps: Sequence[Step]) -> "LandmarkUncertainty":
         """How well the relative position of landmarks is known that ``steps`` have."""

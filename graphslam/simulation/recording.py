@@ -70,19 +70,28 @@ def sensor_rng(seed: int, *names: str) -> np.random.Generator:
     return np.random.default_rng([seed, *(zlib.crc32(name.encode()) for name in names)])
 
 
-def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: int) -> SimulatedLog:
+def record_visit(
+    scenario: Scenario,
+    visit: SimulatedVisit,
+    path: Path,
+    seed: int,
+    materials_seed: int | None = None,
+) -> SimulatedLog:
     """Simulate a visit and write its log to ``path``.
+
+    ``materials_seed`` is that of the biases of materials; the same as ``seed`` by default.
 
     Raises:
         OutputError: the log cannot be written.
     """
+    materials = seed if materials_seed is None else materials_seed
     events: list[Event] = []
     robots: dict[str, RobotSummary] = {}
     ideal_scans: dict[str, NoiseFreeScans] = {}
     all_scans: list[NoiseFreeScans] = []
     sighted: set[str] = set()
     for name, actor in visit.actors.items():
-        this = _Recorder(name, actor, visit, seed)
+        this = _Recorder(name, actor, visit, seed, materials)
         wheels, end_m = _wheels(this)
         events += _gyroscope(this)
         recorded = [_scans(this, *laser) for laser in actor.robot.scanners.items()]
@@ -101,7 +110,7 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
         )
     events.sort(key=lambda event: event.stamp_ns)  # stable: robots in order, odometry first
     first_ns = min(event.stamp_ns for event in events)
-    with LogWriter(path, _notes(scenario, visit, seed)) as log:
+    with LogWriter(path, _notes(scenario, visit, seed, materials)) as log:
         for name, actor in visit.actors.items():
             for sensor, laser in actor.robot.scanners.items():
                 log.mount(name, first_ns, told_mount(laser), sensor)
@@ -112,9 +121,13 @@ def record_visit(scenario: Scenario, visit: SimulatedVisit, path: Path, seed: in
     return SimulatedLog(visit, path, log.counts, robots, ideal_scans)
 
 
-def _notes(scenario: Scenario, visit: SimulatedVisit, seed: int) -> dict[str, str]:
+def _notes(
+    scenario: Scenario, visit: SimulatedVisit, seed: int, materials_seed: int
+) -> dict[str, str]:
     """The metadata of the log, from which it can be reproduced."""
     notes = {"format": "simulation", "scenario": scenario.name, "seed": str(seed)}
+    if materials_seed != seed:
+        notes["materials seed"] = str(materials_seed)
     if visit.name:
         notes["visit"] = visit.name
     for name, actor in visit.actors.items():
@@ -135,6 +148,7 @@ class _Recorder:
     actor: SimulatedRobot
     visit: SimulatedVisit
     seed: int
+    materials_seed: int
 
     def rng(self, sensor: str) -> np.random.Generator:
         """Random numbers of one of its sensors."""
@@ -226,7 +240,8 @@ def _biases(this: _Recorder, laser: Laser) -> Array:
     """Range bias, m, of each surface (n,); the other robots' come last.
 
     A material has the same normalised bias at every visit and for every laser, times the laser's
-    sigma. Each face of a wall is a material, all faces of a box are one.
+    sigma, in all logs of one ``materials_seed``. Each face of a wall is a material, all faces of a
+    box are one.
     """
     world = this.visit.world
     materials = [
@@ -234,7 +249,9 @@ def _biases(this: _Recorder, laser: Laser) -> Array:
         for name, thing in zip(world.names, world.things, strict=True)
     ]
     materials += [f"robot {other}" for other in this.visit.actors if other != this.name]
-    draws = [sensor_rng(this.seed, "material", material).normal() for material in materials]
+    draws = [
+        sensor_rng(this.materials_seed, "material", material).normal() for material in materials
+    ]
     return laser.bias_sigma_m * np.array(draws, dtype=float)
 
 

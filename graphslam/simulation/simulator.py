@@ -33,11 +33,16 @@ class Simulation:
         return sum((Counter(recording.counts) for recording in self.recordings), Counter())
 
 
-def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
+def simulate(
+    scenario: Scenario, target: Path, seed: int = 0, *, materials_seed: int | None = None
+) -> Simulation:
     """Write the log ``target``, or the folder ``target`` if the scenario has two visits.
 
     The folder has reference.mcap, later.mcap and truth.json; it appears whole or not at all. An
     existing target is replaced. Equal scenarios and seeds give equal bytes.
+
+    ``materials_seed``: of the biases of ranges from materials, which belong to the building, so
+    that they stay the same in logs of one building with different seeds; ``seed`` by default.
 
     Raises:
         ScenarioError: the scenario is infeasible, see `graphslam.simulation.scene.prepare_visits`.
@@ -47,7 +52,7 @@ def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
     if len(visits) == 1:
         if target.is_dir():
             raise OutputError(f"{target}: is a folder; this scenario makes one log: -o LOG.mcap")
-        recording = record_visit(scenario, visits[0], target, seed)
+        recording = record_visit(scenario, visits[0], target, seed, materials_seed)
         return Simulation(scenario.name, seed, target, (recording,), 0)
     if target.is_file() or target.suffix == ".mcap":
         raise OutputError(f"{target}: this scenario makes two logs; name a folder: -o DIR")
@@ -58,7 +63,8 @@ def simulate(scenario: Scenario, target: Path, seed: int = 0) -> Simulation:
             raise OutputError(f"{target}: is no folder of two visits; choose another name")
     with atomic_folder(target, before) as part:
         first, second = (
-            record_visit(scenario, visit, part / f"{visit.name}.mcap", seed) for visit in visits
+            record_visit(scenario, visit, part / f"{visit.name}.mcap", seed, materials_seed)
+            for visit in visits
         )
         truth = true_changes(scenario, (first, second), seed)
         text = json.dumps(truth, indent=1, allow_nan=False) + "\n"

@@ -8,18 +8,18 @@ from graphslam.core.config import LoopClosureConfig
 from graphslam.mapping.submaps import SubmapPose
 from graphslam.multi_robot import hypothesis_choice
 from graphslam.multi_robot.hypothesis_choice import doubt
-from graphslam.multi_robot.map_localisation import Support, self_contradictions
+from graphslam.multi_robot.map_localisation import Support, self_contradictions, support
 from graphslam.perception.scan_matching import make_submap
 
 BOX = rectangles((-3.5, -2.0, -2.5, -1.0))
 
 
-def places(seen, spacing_m=3.0):
+def places(seen, spacing_m=3.0, box=BOX):
     """Places (n) of one path, all from about the same pose; ``seen`` (n): whether with the box."""
     made = []
     for k, with_box in enumerate(seen):
         pose = np.array([0.1 * k - 2.0, 1.0, 0.3 * k])
-        walls = np.concatenate([L_ROOM, BOX]) if with_box else L_ROOM
+        walls = np.concatenate([L_ROOM, box]) if with_box else L_ROOM
         submap = make_submap(np.zeros((1, 3)), [cloud(pose, walls)])
         made.append(SubmapPose(("r", k), pose, spacing_m * k, (k, k), submap))
     return made
@@ -55,3 +55,17 @@ def test_places_that_contradict_a_map_no_more_than_each_other_are_no_doubt(
     placed = Support(np.zeros((n, 3)), np.ones(n), yes, against, absent * against)
     said = doubt(placed, [], LoopClosureConfig())
     assert bool(said) == is_doubted
+
+
+def test_what_was_pushed_as_much_as_is_said_contradicts_nothing():
+    """A visit that was displaced onto the walls: the box is where it was but for the push. Pushed
+    otherwise it is where nothing was, and nothing is where it was."""
+    push = np.array([0.3, 0.2])
+    before, after = places([True] * 2), places([True] * 2, box=BOX + push)
+    shares = [
+        support(before, after, motions).absent.max()
+        for motions in ([push], [], [np.array([0.6, -0.1])])
+    ]
+    # of what is seen the box is some two per cent
+    assert shares[0] < 0.004
+    assert min(shares[1:]) > 0.01

@@ -1,6 +1,7 @@
 """Sessions of one room, solved as one batch: joined by what the whole drives show, or refused."""
 
 from dataclasses import replace
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,8 @@ from walls import rectangles
 import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import EstimationError, OutputError
+from graphslam.core.geometry import between
+from graphslam.core.records import Closure
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.trajectory_metrics import pair_poses
 from graphslam.logs import open_logs, read_truth
@@ -18,6 +21,7 @@ from graphslam.pipeline.log_kind import is_session_log
 from graphslam.pipeline.start_priors import start_poses
 from graphslam.results.report import render
 from graphslam.simulation import load_scenario, simulate
+from graphslam.slam.smooth import smooth
 
 BOX = (0, 0, 10, 8), (4, 3.5, 6, 4.5)
 #: corners of furniture that tell the room from itself turned by half a turn
@@ -97,6 +101,46 @@ def test_a_small_room_is_all_that_there_is_to_recognise(tmp_path):
     assert "min_place_extent_m=" in apart(graphslam.smooth(days, config=default))
 
 
+@pytest.mark.parametrize("is_told", [False, True])
+def test_closures_refused_between_sessions_are_told_from_those_within_them(tmp_path, is_told):
+    """Where a session was found, what its places say of where it is was judged then. Counted as
+    what speaks against the map they made right maps doubtful (`verdict`); not counted apart, or
+    apart also where starts were told and nothing was judged, they would again, or none would."""
+    days = sessions(tmp_path, FURNISHED, FURNISHED)
+    config = SAME_PLACE
+    if is_told:
+        told = {f"start.poses.day{n}": true_pose(0.0, 0.3 * n).tolist() for n in range(2)}
+        config = graphslam.load_config(config, **told)
+    added = WrongClosures()
+    result = smooth(open_logs(days, config), config, tamper=added)
+    assert set(result.summary["frames"].values()) == {"day0"}
+    assert added.between and added.within
+    counts = result.summary["consolidated"]
+    assert counts["closures_refused"] == len(added.between) + len(added.within)
+    assert counts["closures_refused_between"] == (0 if is_told else len(added.between))
+
+
+class WrongClosures:
+    """Adds closures that are off by 1.5 m, between two sessions and within them, once each."""
+
+    def __init__(self):
+        self.between, self.within = set(), set()
+
+    def __call__(self, found, places):
+        made = []
+        for kind in (self.between, self.within):
+            for later, other in combinations(places[::-1], 2):
+                is_between = later.state[0] != other.state[0]
+                far = np.hypot(*(later.pose - other.pose)[:2]) > 3.0
+                if far and len(kind) < 2 and is_between == (kind is self.between):
+                    delta = between(other.pose, later.pose) + np.array([1.5, 0.5, 0.0])
+                    wrong = Closure(*later.state, *other.state, delta, 1e-4 * np.eye(3))
+                    if wrong.pair not in self.between | self.within:
+                        kind.add(wrong.pair)
+                        made.append(wrong)
+        return [*found, *made]
+
+
 def apart(result):
     """Why the second day is not joined."""
     return result.summary["sessions"]["apart"]["day1"]
@@ -139,9 +183,10 @@ def test_furniture_that_was_pushed_alike_drags_no_session(tmp_path, push_m):
 
 def test_a_session_lies_on_the_walls_and_not_on_what_was_pushed_alike(tmp_path):
     """All furniture of the lab was pushed by 25 cm: it lay on itself, each wall of the room stood
-    twice, and the second day was 25 cm off, with a good verdict (seed 2)."""
+    twice, and the second day was 25 cm off, with a good verdict (seed 2). Then it was right, but
+    doubtful (seed 0): places were counted that contradict where it had been laid before."""
     push_m = np.array([0.22, 0.12])
-    days = [lab(tmp_path / f"day{n}.mcap", n * push_m, seed=4 + n) for n in range(2)]
+    days = [lab(tmp_path / f"day{n}.mcap", n * push_m, seed=n) for n in range(2)]
     truth = read_truth(days, SAME_PLACE).trajectories
     told = {f"start.poses.{name}": path.poses[0].tolist() for name, path in truth.items()}
     result = graphslam.smooth(days, config=SAME_PLACE, **told)
@@ -152,7 +197,7 @@ def test_a_session_lies_on_the_walls_and_not_on_what_was_pushed_alike(tmp_path):
     )
     # biases of surfaces are 1 cm: where nothing was pushed up to 2 cm are left
     assert np.hypot(*(second - first)[:2]) < 0.03
-    assert "twice" not in str(result.summary["verdict"])
+    assert result.summary["verdict"]["verdict"] == "good", result.summary["verdict"]
 
 
 def lab(path, push_m, seed):

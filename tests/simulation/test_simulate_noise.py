@@ -45,10 +45,10 @@ def robot(*, laser=None, encoders=None, drive=ROUND_TRIP, start=(1.5, 1.5), **mo
 class Log:
     """A scenario simulated and read back, by kind of message and robot."""
 
-    def __init__(self, path, robots, things=None, seed=1, **more):
+    def __init__(self, path, robots, things=None, seed=1, materials_seed=None, **more):
         world = StaticObjects(walls=(ROOM,)) if things is None else things
         scenario = Scenario(robots, world, name="test", truth_period_s=0.05, **more)
-        self.simulation = simulate(scenario, path / "log.mcap", seed)
+        self.simulation = simulate(scenario, path / "log.mcap", seed, materials_seed=materials_seed)
         config = load_config()
         self.messages = list(open_logs([path / "log.mcap"], config).messages())
         self.true = read_truth([path / "log.mcap"], config)
@@ -144,6 +144,23 @@ def test_every_wall_has_its_bias_for_all_lasers_and_scans(tmp_path):
         assert same.mean() > 0.98  # the rest met the other robot
     np.testing.assert_allclose(3 * np.array(found["a"]), found["b"], atol=1e-5)
     assert len(set(np.round(found["a"], 6))) == 4
+
+
+def test_walls_keep_their_biases_in_logs_of_one_building(tmp_path):
+    """On every day each surface had another one, and walls that nobody moved were elsewhere."""
+    laser = replace(QUIET, bias_sigma_m=0.01, range_sigma_m=0.002)
+    days = {}
+    for seed, building in ((1, 7), (2, 7), (2, None)):
+        folder = tmp_path / f"{seed}-{building}"
+        folder.mkdir()
+        log = Log(folder, {"robot": robot(laser=laser)}, seed=seed, materials_seed=building)
+        residuals, scans = scan_residuals(log)
+        marked = room_ranges(log.poses(scans), scans[0].angles, (1000, 2000, 3000, 4000))
+        wall = np.round(marked, -3).astype(int) // 1000
+        days[seed, building] = np.array([np.median(residuals[wall == k]) for k in (1, 2, 3, 4)])
+    # medians of thousands of beams of 2 mm white noise
+    assert np.abs(days[1, 7] - days[2, 7]).max() < 2e-4
+    assert np.abs(days[2, None] - days[2, 7]).max() > 2e-3
 
 
 def test_biases_of_many_walls_have_their_sigma(tmp_path):
