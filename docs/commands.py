@@ -3,6 +3,7 @@
 Run: python docs/commands.py   (or `make pages`)
 """
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,14 @@ PAGES = ("commands.md", "schemas.md")
 COMMANDS = """\
 # Commands
 
-Made from the program by `make pages`. Every command has `-h` with examples (here at the end of
-each section), `--json` (exactly one object on stdout, see
-[formats](formats.md#what-commands-print-with---json)) and `--debug` (tracebacks).
-`graphslam --install-completion` completes commands, options and names in the shell.
-Exit codes are in [formats](formats.md#exit-codes)."""
+Every command with its arguments and options. The page is made from the program by `make pages`.
+
+- Every command has `-h` with examples (here at the end of each section), `--json` (exactly one
+  object on stdout, see [formats](formats.md#what-commands-print-with---json)) and `--debug`
+  (tracebacks).
+- Exit codes are in [formats](formats.md#exit-codes).
+- Settings (`--config`, `--set`) are in [configuration](configuration.md).
+- `graphslam --install-completion` completes commands, options and names in the shell."""
 
 SCHEMAS = """\
 # Messages
@@ -43,18 +47,29 @@ Their definitions are in every log that has them, so that any tool decodes them.
 def commands() -> str:
     """The page of commands."""
     group = typer.main.get_command(app)
-    parts = [COMMANDS]
+    parts = [COMMANDS, _contents(group)]
     for name, command in sorted(group.commands.items()):
         own = [p for p in command.params if p.name not in ("help", "json", "debug")]
         usage = [p.metavar for p in own if p.param_type_name == "argument"]
         text, _, examples = (command.help or "").partition("\b\nExamples:\n")
         line = " ".join(["graphslam", name, *usage, "[OPTIONS]"])
-        parts.append(f"## {name}\n\n{' '.join(text.split())}\n\n```text\n{line}\n```")
+        told = textwrap.fill(" ".join(text.split()), 120, break_on_hyphens=False)
+        parts.append(f"## {name}\n\n{told}\n\n```text\n{line}\n```")
         rows = [f"| `{_cell(_written(p))}` | {_cell(p.help or '')} |" for p in own]
         parts.append("\n".join(["| | |", "|---|---|", *rows]))
         shown = "\n".join(line.strip() for line in examples.splitlines())
         parts += [f"```\n{shown}\n```"] if shown else []
     return "\n\n".join(parts) + "\n"
+
+
+def _contents(group: Any) -> str:
+    """A table of all commands: the first sentence of what each does."""
+    firsts = {
+        name: " ".join((command.help or "").split()).split(". ")[0].rstrip(".")
+        for name, command in sorted(group.commands.items())
+    }
+    rows = [f"| [{name}](#{name}) | {_cell(first)} |" for name, first in firsts.items()]
+    return "\n".join(["| command | what it does |", "|---|---|", *rows])
 
 
 def _written(parameter: Any) -> str:
