@@ -4,6 +4,7 @@ Run: python docs/commands.py   (or `make pages`)
 """
 
 import textwrap
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +32,20 @@ Every command with its arguments and options. The page is made from the program 
 SCHEMAS = """\
 # Messages
 
-Made from the program by `make pages`. What topics mean and how they are found: [logs](logs.md).
+Which messages are read, and the definitions of our own. The page is made from the program by
+`make pages`. What topics mean and how they are found: [logs](logs.md).
 
 ## Messages of ROS 2 that are read
 
-`{ros}`
+{ros}
 
 Encodings: `{translated}`; ROS 1 and Foxglove messages are translated to these.
 
 ## Our own messages
 
-Their definitions are in every log that has them, so that any tool decodes them."""
+Their definitions are in every log that has them, so that any tool decodes them.
+
+{own}"""
 
 
 def commands() -> str:
@@ -84,10 +88,23 @@ def messages() -> str:
     """The page of messages."""
     own = schemas.DEFINITIONS
     ros = sorted(name for name in schemas.KNOWN if name not in own)
-    head = SCHEMAS.format(ros="`, `".join(ros), translated="`, `".join(sorted(TRANSLATIONS)))
+    head = SCHEMAS.format(
+        ros="\n".join(f"- `{name}`" for name in ros),
+        translated="`, `".join(sorted(TRANSLATIONS)),
+        own="\n".join(
+            ["| message | what it is |", "|---|---|", *map(_message_row, sorted(own.items()))]
+        ),
+    )
     parts = [head]
     parts += [f"### {name}\n\n```text\n{text.strip()}\n```" for name, text in sorted(own.items())]
     return "\n\n".join(parts) + "\n"
+
+
+def _message_row(item: tuple[str, str]) -> str:
+    """A message and the comment with which its definition begins."""
+    name, definition = item
+    lines = takewhile(lambda line: line.startswith("#"), definition.strip().splitlines())
+    return f"| `{name}` | {_cell(' '.join(line.strip('# ') for line in lines))} |"
 
 
 def _cell(text: str) -> str:
