@@ -11,7 +11,7 @@ errors tell how good the maps are,
 where those of the days that made them also depend on what was known by then. By the error of the
 told start both maps are moved alike, and either's own error may make it up by chance. So errors
 are printed in the world, and in the world as the told start has it. Timed is the CPU time of each
-day.
+day. The biases of surfaces belong to the building: they are drawn once for all logs of a seed.
 
 Run: python benchmarks/prior_map.py [office] [repeated] [days] [--seeds N] [--first SEED]
 """
@@ -90,7 +90,7 @@ def office(folder: Path, seeds: Sequence[int]) -> Iterator[str]:
     scenario = load_scenario("office-loop")
     errors, nees, bounds, poses, wrong = [], [], [], [], 0
     for seed in seeds:
-        simulate(scenario, folder / "first.mcap", 1000 + seed)
+        simulate(scenario, folder / "first.mcap", 1000 + seed, materials_seed=seed)
         known = mapped(folder, folder / "first.mcap", seed)
         log = visit(folder, scenario, seed)
         (folder / "first.mcap").unlink()
@@ -130,18 +130,22 @@ def far_off(result: Result, truth: Mapping[str, Trajectory]) -> bool:
     return bool(np.hypot(off[0], off[1]) > WRONG_M)
 
 
-def visit(folder: Path, scenario: Scenario, seed: int, seconds: int = 0) -> Path:
+def visit(
+    folder: Path, scenario: Scenario, seed: int, seconds: int = 0, building: int | None = None
+) -> Path:
     """The log of half a round from anywhere on it, in either direction, so much later.
 
-    A round on which the robot drives into what has been moved is drawn again.
+    A round on which the robot drives into what has been moved is drawn again. ``building``: the
+    seed of the biases of its surfaces, ``seed`` by default.
     """
+    building = seed if building is None else building
     rng = np.random.default_rng(seed)
     path, now = folder / f"visit{seconds // DAY_S}.mcap", folder / "now.mcap"
     path.unlink(missing_ok=True)
     while not path.exists():
         now.unlink(missing_ok=True)
         with suppress(ScenarioError):
-            simulate(half_a_round(scenario, rng), now, seed)
+            simulate(half_a_round(scenario, rng), now, seed, materials_seed=building)
             later(now, path, seconds)
     return path
 
@@ -214,7 +218,7 @@ def repeated(folder: Path, seeds: Sequence[int]) -> Iterator[str]:
         )
         log = folder / "first.mcap"
         log.unlink(missing_ok=True)
-        simulate(replace(scenario, robots={name: whole}), log, 2000 + seed)
+        simulate(replace(scenario, robots={name: whole}), log, 2000 + seed, materials_seed=seed)
         known = mapped(folder, log, seed)
         begin = WIDE_M * int(rng.integers(3, 5)) + rng.uniform(0.0, WIDE_M)
         for what, until in (("middle", begin + 3 * WIDE_M), ("to the end", end)):
@@ -222,7 +226,7 @@ def repeated(folder: Path, seeds: Sequence[int]) -> Iterator[str]:
             own = replace(robot, start_m=(begin, middle), start_deg=0.0, drive=drive)
             log = folder / "visit.mcap"
             log.unlink(missing_ok=True)
-            simulate(replace(scenario, robots={name: own}), log, seed)
+            simulate(replace(scenario, robots={name: own}), log, seed, materials_seed=seed)
             try:
                 result = graphslam.smooth(log, **{"known_map.directory": str(known)})
             except EstimationError:
@@ -269,7 +273,7 @@ def days_of_seed(folder: Path, seed: int) -> Generator[str, None, Array]:
     """
     scenario = load_scenario("office-loop")
     first = folder / "first.mcap"
-    simulate(scenario, first, 3000 + seed)
+    simulate(scenario, first, 3000 + seed, materials_seed=seed)
     known = mapped(folder, first, seed)
     logs, continued = [first], []
     for number in range(1, DAYS + 1):
@@ -328,7 +332,8 @@ def days_of_seed(folder: Path, seed: int) -> Generator[str, None, Array]:
 def day(folder: Path, scenario: Scenario, seed: int, number: int) -> Path:
     """The log of a day on which furniture has been moved."""
     number_of_all = number + 100 * seed
-    return visit(folder, changed(scenario, seed, number), number_of_all, DAY_S * number)
+    now = changed(scenario, seed, number)
+    return visit(folder, now, number_of_all, DAY_S * number, building=seed)
 
 
 def told_off(log: Path, seed: int) -> Array:
