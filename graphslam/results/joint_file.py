@@ -5,6 +5,7 @@ the final states is sparse; `graphslam.estimation.joint_covariances` computes fr
 for. The layout is documented in docs/formats.md.
 """
 
+import zlib
 from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
@@ -19,6 +20,10 @@ from graphslam.core.information_root import InformationRoot
 from graphslam.core.mount_covariances import MountCovariances
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, JointScans, RobotResult, ScanTies, Trajectory
+
+#: what reading a damaged file of arrays (.npz) and their contents raises: an empty one, one that is
+#: cut, one with wrong bytes, one that lacks arrays
+UNREADABLE = (OSError, EOFError, BadZipFile, zlib.error, ValueError, KeyError, IndexError)
 
 FORMAT = 2
 _UPPER = np.triu_indices(3)
@@ -97,9 +102,9 @@ def read_joint(path: Path) -> JointScans:
         OutputError: it cannot be read.
     """
     try:
-        with np.load(path) as file:
+        with path.open("rb") as stream, np.load(stream) as file:
             return _joint({name: file[name] for name in file.files})
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+    except UNREADABLE as error:
         raise OutputError(f"{path}: {error}") from error
 
 

@@ -14,7 +14,6 @@ from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -36,7 +35,7 @@ from graphslam.mapping.submaps import SubmapPose, build_submaps
 from graphslam.odometry.mount_covariance import moved_by_world
 from graphslam.results.file_formats import landmark_from_json, landmark_json
 from graphslam.results.folder import SavedResult, check_one_frame, load
-from graphslam.results.joint_file import joint_scans
+from graphslam.results.joint_file import UNREADABLE, joint_scans
 from graphslam.results.scans_file import SCANS_FILE, read_scans
 from graphslam.slam.summary import FORMAT as RESULT_FORMAT
 
@@ -296,7 +295,7 @@ def _read(path: Path, name: str, matching: ScanMatchingConfig) -> KnownMap:
                 "smooth its logs again"
             )
         return _known_map(arrays, name, hashlib.sha256(data).hexdigest(), matching)
-    except (OSError, ValueError, KeyError, IndexError, BadZipFile) as error:
+    except UNREADABLE as error:
         raise OutputError(f"{path}: {error}") from error
 
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from graphslam.core.errors import OutputError
 from graphslam.core.geometry import Array
 from graphslam.core.records import KeyframeScan, Trajectory
+from graphslam.results.joint_file import UNREADABLE
 
 FORMAT = 1
 SCANS_FILE = "scans.npz"
@@ -76,7 +76,7 @@ def read_scans(path: Path) -> tuple[PlacedScan, ...]:
     if not path.exists():
         return ()
     try:
-        with np.load(path) as file:
+        with path.open("rb") as stream, np.load(stream) as file:
             arrays = {name: file[name] for name in file.files}
             names = [str(name) for name in arrays["robots"]]
             clouds = np.split(arrays["points"], np.cumsum(arrays["count"])[:-1])
@@ -88,5 +88,5 @@ def read_scans(path: Path) -> tuple[PlacedScan, ...]:
                     strict=True,
                 )
             )
-    except (OSError, ValueError, KeyError, IndexError, BadZipFile) as error:
+    except UNREADABLE as error:
         raise OutputError(f"{path}: {error}") from error

@@ -14,6 +14,7 @@ from graphslam.estimation.joint_covariances import (
     joint_covariance,
     pair_covariances,
     solve_root,
+    variances_of,
 )
 from graphslam.estimation.selected_inverse import covariance_blocks
 
@@ -72,6 +73,12 @@ def test_covariances_are_those_of_the_inverse_information(seed):
     P = np.linalg.inv(R.T @ R)
     found = covariance_of(root, rows, columns, derivatives, k)
     np.testing.assert_allclose(found, E.T @ P @ E, atol=1e-10 * np.abs(P).max())
+    # the shared errors too, of which each combination has its own
+    root = replace(root, shared=rng.normal(size=(len(R), 3)))
+    found = covariance_of(root, rows, columns, derivatives, k)
+    alone = variances_of(root, rows, columns, derivatives, k)
+    np.testing.assert_allclose(alone, np.diag(found), rtol=1e-12)
+    root = replace(root, shared=np.zeros((0, 0)))
     some = rng.permutation(len(R))[:10]
     np.testing.assert_allclose(
         joint_covariance(root, some), P[np.ix_(some, some)], atol=1e-12 * np.abs(P).max()
