@@ -14,7 +14,7 @@ import numpy as np
 from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, between
-from graphslam.core.motion_models import HELD_SIGMA, Calibration
+from graphslam.core.motion_models import HELD_SIGMA, Calibration, several_lasers
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step, Trajectory
 from graphslam.estimation.calibration_graph import (
@@ -25,7 +25,11 @@ from graphslam.estimation.calibration_graph import (
 from graphslam.estimation.motion_arrays import at_calibration
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
-from graphslam.odometry.calibration_jacobian import at_estimated_motion
+from graphslam.odometry.calibration_jacobian import (
+    CalibratedSource,
+    at_estimated_motion,
+    by_latency,
+)
 from graphslam.odometry.preintegration import Track
 
 #: times that everything is solved: after the first the calibration moves by a tenth of its sigma
@@ -194,7 +198,10 @@ def _recomputed(motions: Sequence[Motion], track: Track, states: Trajectory | No
     new = dataclasses.replace(new, cov=new.cov + uncovered_covs(track, *ends.T))
     if states is not None:
         estimated = between(*(states.at(end) for end in ends.T))
-        new = dataclasses.replace(new, d_cal=at_estimated_motion(track, new, estimated))
+        d_cal = at_estimated_motion(CalibratedSource.of(track), new.delta, new.d_cal, estimated)
+        if track.is_mounted and not track.has_burst_stamps and not several_lasers(track.prior):
+            d_cal[:, :, -1] = by_latency(states, *ends.T)
+        new = dataclasses.replace(new, d_cal=d_cal)
     return [new.one(k, m.start_ns, m.end_ns) for k, m in enumerate(motions)]
 
 

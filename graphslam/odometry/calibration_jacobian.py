@@ -7,35 +7,123 @@ estimated motion makes it total least squares (S. Van Huffel and J. Vandewalle, 
 Squares Problem, 1991, DOI 10.1137/1.9781611971002).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from graphslam.core.geometry import Array, compose, inverse, log
-from graphslam.core.motion_models import mounted_motion, several_lasers
-from graphslam.odometry.increment_sums import Motions
+from graphslam.core.arrays import IntArray
+from graphslam.core.config import OdometryConfig, RobotConfig
+from graphslam.core.geometry import Array, between, compose, exp, inverse, log, wrap
+from graphslam.core.motion_models import (
+    MOTION_SOURCES,
+    Calibration,
+    mounted_motion,
+    rows_of_twists,
+    several_lasers,
+)
+from graphslam.core.records import Trajectory
 from graphslam.odometry.mounted_motions import lever_to
+from graphslam.odometry.path_sums import LATENCY_STEP_NS
 from graphslam.odometry.preintegration import Track
 
+#: ns: velocities are the motion from so long before to so long after
+BASELINE_NS = 250_000_000
 
-def at_estimated_motion(track: Track, measured: Motions, estimated: Array) -> Array:
-    """Derivative (n, 3, p) of motions by a track's calibration, at the estimated motion.
 
-    That by a latency stays: it is a difference of velocities.
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedSource:
+    """A source of motion, see `MOTION_SOURCES`, and the calibration that its motions are made with.
+
+    ``parameters``: number p of those of the odometry. ``is_mounted``: those of the mount and the
+    latency of a sensor follow.
+    """
+
+    source: str
+    robot: RobotConfig
+    config: OdometryConfig
+    calibration: Calibration
+    parameters: int
+    is_mounted: bool
+
+    @classmethod
+    def of(cls, track: Track) -> "CalibratedSource":
+        """That of a track, as its calibration is now."""
+        return cls(
+            track.source, track.robot, track.config, track.calibration,
+            track.increment_parameters, track.is_mounted,
+        )  # fmt: skip
+
+    @property
+    def mount(self) -> Array:
+        """See `Track.mount`."""
+        where = slice(self.parameters, self.parameters + 3)
+        return self.calibration.mean[where] if self.is_mounted else np.zeros(3)
+
+    def derivative(self, twists: Array) -> Array:
+        """Derivative (n, 3, p) of motions on arcs, by their twists (n, 3), by the calibration."""
+        rows = rows_of_twists(self.source, twists, self.robot)
+        known = self.calibration.mean[: self.parameters]
+        return MOTION_SOURCES[self.source](rows, known, self.robot, self.config).d_cal
+
+
+def at_estimated_motion(
+    source: CalibratedSource, delta: Array, d_cal: Array, estimated: Array
+) -> Array:
+    """Derivative (n, 3, p) of motions by the calibration of their source, at the estimated motion.
+
+    That by a latency stays, see `by_latency`.
 
     Args:
-        track: of one robot; with several lasers the derivative stays as it is.
-        measured: n motions of the frame at the track's mount, by odometry.
-        estimated: (n, 3) the same by an estimate.
+        source: of one robot; with several lasers the derivative stays as it is.
+        delta: (n, 3) motions of the frame at the mount, by odometry.
+        d_cal: (n, 3, p) their derivative, as measured.
+        estimated: (n, 3) the same motions by an estimate.
     """
-    d_cal, p = measured.d_cal, track.increment_parameters
-    if not d_cal.shape[2] or several_lasers(track.calibration):
+    p = source.parameters
+    if not d_cal.shape[2] or several_lasers(source.calibration):
         return d_cal
-    d_cal, mount = d_cal.copy(), np.broadcast_to(track.mount, estimated.shape)
-    of_base = [
-        compose(compose(mount, motion), inverse(mount)) for motion in (estimated, measured.delta)
-    ]
+    d_cal, mount = d_cal.copy(), np.broadcast_to(source.mount, estimated.shape)
+    of_base = [compose(compose(mount, motion), inverse(mount)) for motion in (estimated, delta)]
     if p:
-        change = np.subtract(*(track.derivative(log(motion)) for motion in of_base))
+        change = np.subtract(*(source.derivative(log(motion)) for motion in of_base))
         d_cal[:, :, :p] += lever_to(of_base[1], mount) @ change
-    if track.is_mounted:
+    if source.is_mounted:
         d_cal[:, :, p : p + 3] = mounted_motion(of_base[0], mount)[1]
     return d_cal
+
+
+def by_latency(states: Trajectory, start_ns: IntArray, end_ns: IntArray) -> Array:
+    """Derivative (n, 3) of motions of a sensor by its latency, /s, at the estimated velocities.
+
+    Args:
+        states: the estimated ones, of the sensor's frame.
+        start_ns: (n,) times of states at which the motions begin.
+        end_ns: (n,) the same of their ends.
+    """
+    moved = between(states.at(start_ns), states.at(end_ns))
+    change = between(_earlier(states, start_ns), _earlier(states, end_ns)) - moved
+    change[:, 2] = wrap(change[:, 2])
+    return change * (1e9 / LATENCY_STEP_NS)
+
+
+def _earlier(states: Trajectory, times_ns: IntArray) -> Array:
+    """Poses (n, 3) `LATENCY_STEP_NS` before times, at the mean velocity around them.
+
+    The velocity at the very time would contain the noise of the odometry there, which is in the
+    residual as well.
+    """
+    first, last = states.stamps_ns[0], states.stamps_ns[-1]
+    begin, end = (np.clip(times_ns + dt, first, last) for dt in (-BASELINE_NS, BASELINE_NS))
+    moved = log(between(_interpolated(states, begin), _interpolated(states, end)))
+    step = -LATENCY_STEP_NS / np.maximum(end - begin, 1)[:, None] * moved
+    return compose(states.at(times_ns), exp(step))
+
+
+def _interpolated(states: Trajectory, times_ns: IntArray) -> Array:
+    """Poses (n, 3) on arcs between states."""
+    last = len(states.stamps_ns) - 1
+    i = np.clip(states.stamps_ns.searchsorted(times_ns), 1, last)
+    begin, end = states.stamps_ns[i - 1], states.stamps_ns[i]
+    share = np.clip((times_ns - begin) / np.maximum(end - begin, 1), 0.0, 1.0)
+    twist = log(between(states.poses[i - 1], states.poses[i]))
+    return compose(states.poses[i - 1], exp(share[:, None] * twist))

@@ -22,6 +22,7 @@ from graphslam.core.motion_models import HELD_SIGMA, MOUNT_NAMES, Calibration, s
 from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Motion
+from graphslam.odometry.calibration_jacobian import CalibratedSource, at_estimated_motion
 
 #: weight of the past per state: the memory is about 1 / (1 - FORGETTING_FACTOR) states, so that
 #: parameters may change slowly (tyres warm up)
@@ -31,6 +32,10 @@ MIN_SIGMA_SHARE = 0.5
 #: squared Mahalanobis distance beyond which a difference is no calibration error but a jump of the
 #: estimate (a loop closure) or a slip
 OUTLIER_D2 = float(chi2_quantile(0.999, 3))
+#: times that motions are left out as outliers, by the noise that the others show
+GATINGS = 2
+#: motions by the noise that is stated, beside those that show it
+NOISE_PRIOR_MOTIONS = 20
 #: no laser's mount is told
 NOTHING_TOLD: Mapping[str, Array] = MappingProxyType({})
 
@@ -48,12 +53,12 @@ class Calibrator:
         self._names: tuple[str, ...] = ()
 
     def update(
-        self, current: Calibration, motion: Motion, moved: Array, observed: Array
+        self, source: CalibratedSource, motion: Motion, moved: Array, observed: Array
     ) -> Calibration:
         """The calibration after one more motion.
 
         Args:
-            current: the calibration that ``motion`` was computed with.
+            source: what ``motion`` was made with.
             motion: according to odometry.
             moved: (3,) the same motion according to the estimate, in the frame of its start.
             observed: (3, 3) information about the motion's end that came from landmarks, along the
@@ -63,7 +68,7 @@ class Calibrator:
         Returns:
             Mean, and the covariance to be used for coming motions.
         """
-        D = motion.d_delta_d_calibration
+        D, current = motion.d_delta_d_calibration, source.calibration
         if motion.from_scans or not D.shape[1] or (motion.length_m == 0 and motion.delta[2] == 0):
             return current
         if self._prior is None:
@@ -75,6 +80,7 @@ class Calibrator:
         miss = moved - motion.delta
         miss[2] = wrap(miss[2])
         noise = motion.cov - D @ current.cov @ D.T + self._floor
+        D = at_estimated_motion(source, motion.delta[None], D[None], moved[None])[0]
         # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
         W = solve(np.eye(3) + observed @ noise, observed)
         total = noise + D @ self._prior @ D.T
@@ -142,28 +148,53 @@ class TrackedMotions:
 class CalibrationEvidence:
     """What motions tell about the p parameters: information (p, p), and that times the mean (p,).
 
-    That of different motions adds up.
+    ``squares`` and ``stated`` (3,): along each axis the sum of squared errors of odometry, and what
+    it would be by the noise that is stated, of ``count`` motions. All of different motions add up.
     """
 
     information: Array
     vector: Array
+    squares: Array
+    stated: Array
+    count: int
 
     def __add__(self, other: "CalibrationEvidence") -> "CalibrationEvidence":
-        return CalibrationEvidence(self.information + other.information, self.vector + other.vector)
+        return CalibrationEvidence(
+            self.information + other.information,
+            self.vector + other.vector,
+            self.squares + other.squares,
+            self.stated + other.stated,
+            self.count + other.count,
+        )
 
     @classmethod
     def none(cls, parameters: int) -> "CalibrationEvidence":
         """Nothing is known."""
-        return cls(np.zeros((parameters, parameters)), np.zeros(parameters))
+        nothing = np.zeros(parameters)
+        return cls(np.diag(nothing), nothing, np.zeros(3), np.zeros(3), 0)
 
-    @classmethod
-    def of(cls, found: TrackedMotions, config: OdometryConfig) -> "CalibrationEvidence":
-        """How tracked motions differ from those of odometry.
+    @property
+    def noise_scale(self) -> Array:
+        """How many times (3,) the stated variances those of odometry are; not less than one."""
+        if not self.count:
+            return np.ones(3)
+        prior = NOISE_PRIOR_MOTIONS / self.count * self.stated
+        scale = (self.squares + prior) / np.maximum(self.stated + prior, 1e-300)
+        return np.asarray(np.maximum(scale, 1.0))
+
+    def with_motions(
+        self, found: TrackedMotions, source: CalibratedSource, config: OdometryConfig
+    ) -> "CalibrationEvidence":
+        """The same with further tracked motions, by how they differ from those of odometry.
 
         What landmarks alone say about a motion is what the estimate knows beyond odometry:
         information O = P⁻¹ - Q⁻¹ for covariances P after tracking and Q of odometry, and
         O (z - m) = P⁻¹ (moved - m) for its own measurement z. Motions that are far off (slip) do
         not count.
+
+        Where odometry is noisier than stated, the estimate follows its noise, and a scale of -1
+        would explain that. So the noise is measured first: the squared difference moved - m is
+        expected to be P O (f Q + O⁻¹) O P, where f Q is the noise, f times as stated.
         """
         miss = found.moved - found.delta
         miss[:, 2] = wrap(miss[:, 2])
@@ -172,15 +203,44 @@ class CalibrationEvidence:
         seen = after - np.linalg.inv(found.cov)
         values, axes = np.linalg.eigh(0.5 * (seen + seen.mT))
         seen = (axes * np.maximum(values, 0.0)[:, None]) @ axes.mT
+        told = (after @ miss[:, :, None])[:, :, 0]  # O (z - m)
         sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
         floor = np.diag(np.square(sigmas))
-        noise = found.cov - D @ found.calibration.cov @ D.mT + floor
-        gain = np.linalg.inv(np.eye(3) + seen @ noise)
-        used = mahalanobis_squared(miss, found.cov + floor) <= OUTLIER_D2
-        W, weighted = (gain @ seen)[used], (gain @ after @ miss[:, :, None])[used]
+        by_calibration = D @ found.calibration.cov @ D.mT
+        white = found.cov - by_calibration
+        K = found.moved_cov @ seen
+        squares = miss**2 - _diagonal(K @ (by_calibration @ K.mT + found.moved_cov))
+        stated = _diagonal(K @ white @ K.mT)
+        noisier = self
+        for _ in range(GATINGS):
+            scale = np.sqrt(noisier.noise_scale)
+            cov = scale[:, None] * white * scale + by_calibration
+            used = mahalanobis_squared(miss, cov + floor) <= OUTLIER_D2
+            noisier = replace(
+                self,
+                squares=self.squares + squares[used].sum(axis=0),
+                stated=self.stated + stated[used].sum(axis=0),
+                count=self.count + int(used.sum()),
+            )
+        scale = np.sqrt(noisier.noise_scale)
+        white = scale[:, None] * white * scale
+        moved_by = np.linalg.inv(seen + np.linalg.inv(white + by_calibration)) @ told[:, :, None]
+        moved = found.delta + moved_by[:, :, 0]
+        D = at_estimated_motion(source, found.delta, D, moved)
+        gain = np.linalg.inv(np.eye(3) + seen @ (white + floor))[used]
+        W, weighted = gain @ seen[used], gain @ told[used, :, None]
         D = D[used]
         vector = D.mT @ (weighted + W @ (D @ found.calibration.mean)[:, :, None])
-        return cls((D.mT @ W @ D).sum(axis=0), vector.sum(axis=0)[:, 0])
+        return replace(
+            noisier,
+            information=self.information + (D.mT @ W @ D).sum(axis=0),
+            vector=self.vector + vector.sum(axis=0)[:, 0],
+        )
+
+
+def _diagonal(matrices: Array) -> Array:
+    """Diagonals (n, 3) of matrices (n, 3, 3)."""
+    return np.asarray(np.einsum("nii->ni", matrices))
 
 
 def calibration_from_evidence(known: CalibrationEvidence, prior: Calibration) -> Calibration:

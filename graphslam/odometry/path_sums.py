@@ -112,7 +112,7 @@ def path_sums(
         rates = np.array([rates_of_config(track.config) for track in tracks])
         made = tracks[0].increments(rows, mean[of], rates[of])
     if by_rate:
-        covs = unit_error_covs(tracks[0].source, rows, mean[0], tracks[0]._robot)
+        covs = unit_error_covs(tracks[0].source, rows, mean[0], tracks[0].robot)
         made = replace(made, cov=covs)
     first = firsts[of_time]
     index, index_earlier = np.hstack([span.index for span in spans]) + first

@@ -30,7 +30,6 @@ from graphslam.core.motion_models import (
     compound,
     nominal_calibration,
     parameter_cov,
-    rows_of_twists,
     with_rates,
 )
 from graphslam.core.records import Motion, Trajectory
@@ -168,16 +167,11 @@ class Track(Readings):
 
         ``rates`` (n, 9): of the model error, in place of those of the settings.
         """
-        made = MOTION_SOURCES[self.source](rows, calibration, self._robot, self.config, rates)
+        made = MOTION_SOURCES[self.source](rows, calibration, self.robot, self.config, rates)
         if self.config.parameter_noise == "white" and self.source != "given":
-            noise = parameter_cov(self.source, rows, self._robot, self.config)
+            noise = parameter_cov(self.source, rows, self.robot, self.config)
             made = replace(made, cov=made.cov + noise)
         return made
-
-    def derivative(self, twists: Array) -> Array:
-        """Derivative (n, 3, p) of motions on arcs, by their twists (n, 3), by the calibration."""
-        rows = rows_of_twists(self.source, twists, self._robot)
-        return self.increments(rows, self.calibration.mean[: self.increment_parameters]).d_cal
 
     def mounted_pose(self, times_ns: IntArray, sensor: str = "") -> Array:
         """Poses (n, 3) of the frame at ``mount``, the times ``latency_ns`` late; see `pose`.

@@ -74,7 +74,7 @@ class Readings:
         self.bridged_sigma_m = 0.0
         #: what increments leave out
         self.missing = MissingIncrements()
-        self.config, self._robot = config, robot
+        self.config, self.robot = config, robot
         self._count, self._bursts, self._resets = 0, 0, 0
         self._forgotten = 0  # readings, see `forget_before`
         self._integrated = 0  # readings that are integrated; the others' values wait in `_pending`
@@ -220,7 +220,7 @@ class Readings:
         Arrays of one number take six times as long, and where every scan asks for its pose this
         would add up to 15 % to the time of a run.
         """
-        twist = wheel_twist(row[None], self._robot)[0] if self.source == "wheels" else row[:3]
+        twist = wheel_twist(row[None], self.robot)[0] if self.source == "wheels" else row[:3]
         (x, y, turned), (east, north, heading) = exp(twist).tolist(), self._poses[n - 1].tolist()
         c, s, path, turn = math.cos(heading), math.sin(heading), math.hypot(x, y), abs(turned)
         self._rows[n] = row
@@ -373,7 +373,7 @@ def _integrate(group: Sequence[Readings]) -> None:
     twists = rows[:, :3]
     if group[0].source == "wheels":
         parts = np.split(rows, firsts[1:])
-        robots = [one._robot for one in group]
+        robots = [one.robot for one in group]
         twists = np.concatenate(list(map(wheel_twist, parts, robots)))
     x, y, turned = exp(twists).T
     path, turn = np.hypot(x, y), np.abs(turned)

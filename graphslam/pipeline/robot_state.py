@@ -12,6 +12,7 @@ from graphslam.core.motion_models import Calibration
 from graphslam.core.mount_covariances import MountCovariance
 from graphslam.core.records import Motion, RobotResult, Scan, Trajectory
 from graphslam.logs.clock import Clock
+from graphslam.odometry.calibration_jacobian import CalibratedSource
 from graphslam.odometry.interpolation import (
     BetterScans,
     causal_at,
@@ -115,7 +116,7 @@ class RobotState:
         """
         moved = between(self.latest_pose, pose)
         self.track.calibration = self.calibrator.update(
-            self.track.calibration, motion, moved, observed
+            CalibratedSource.of(self.track), motion, moved, observed
         )
 
     def is_causal(self, states: Trajectory) -> bool:

@@ -23,6 +23,7 @@ from graphslam.core.records import TRUE_RECORDS, Message, Motion, Scan
 from graphslam.logs import LogSet
 from graphslam.logs.log_set import ReadReport
 from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_returns
+from graphslam.odometry.calibration_jacobian import CalibratedSource
 from graphslam.odometry.gap_bridging import with_bridged_gaps
 from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.scan_odometry import (
@@ -62,15 +63,15 @@ class KeyframeBlock:
 
     ``start_ns``: time of the first state of the robot. ``pairs``: scans of the first laser that
     `MotionChecker` has to compare, ``last``: the number of its last keyframe, if there is one.
-    ``calibration`` is the one of the motions, ``prior`` that before any data. ``messages``: number
-    of messages read so far; ``seconds`` that all this took.
+    ``source`` is what the motions are made with, ``prior`` its calibration before any data.
+    ``messages``: number of messages read so far; ``seconds`` that all this took.
     """
 
     start_ns: int
     keyframes: Sequence[ScanKeyframe]
     pairs: Sequence[ScanPair]
     last: int | None
-    calibration: Calibration
+    source: CalibratedSource
     prior: Calibration
     messages: int
     seconds: float
@@ -226,10 +227,10 @@ class _Reader:
             if self._state_ns is None:
                 # the first state is where odometry begins, or earlier
                 self._state_ns = first_ns = min(track.first_ns, block[0].time_ns)
-            calibration = track.calibration
+            source = CalibratedSource.of(track)
             keyframes, pairs, last = self._of_block(block)
             yield KeyframeBlock(
-                first_ns, keyframes, pairs, last, calibration, track.prior,
+                first_ns, keyframes, pairs, last, source, track.prior,
                 self._counts["messages"], time.perf_counter() - began,
             )  # fmt: skip
 

@@ -130,8 +130,7 @@ class ScanLog(TrackedLog):
                 moved = self._track(item)
                 if self.config.odometry.calibrate:
                     with timed(self.seconds, "calibration"):
-                        found = self._evidence(item, moved)
-                        known = found if known is None else known + found
+                        known = self._evidence(item, moved, known)
                         calibration = calibration_from_evidence(known, item.prior)
                 # the next block is being read; this is for the one after it
                 reading.send(calibration)
@@ -189,22 +188,26 @@ class ScanLog(TrackedLog):
         self._path.anchors.append(len(self._path.times) - 1)
 
     def _evidence(
-        self, block: KeyframeBlock, tracked: Sequence[tuple[Motion | None, Array, Array]]
+        self,
+        block: KeyframeBlock,
+        tracked: Sequence[tuple[Motion | None, Array, Array]],
+        known: CalibrationEvidence | None,
     ) -> CalibrationEvidence:
-        """What the motions of a block tell about the calibration."""
+        """What the motions so far tell about the calibration, with those of a block."""
+        known = known or CalibrationEvidence.none(len(block.prior.mean))
         used = [(m, at, cov) for m, at, cov in tracked if m is not None and not m.from_scans]
         if not used:
-            return CalibrationEvidence.none(len(block.prior.mean))
+            return known
         motions, moved, covs = zip(*used, strict=True)
         found = TrackedMotions(
             np.array([m.delta for m in motions]),
             np.array([m.cov for m in motions]),
             np.array([m.d_delta_d_calibration for m in motions]),
-            block.calibration,
+            block.source.calibration,
             np.array(moved),
             np.array(covs),
         )
-        return CalibrationEvidence.of(found, self.runs[self._robot].track.config)
+        return known.with_motions(found, block.source, self.runs[self._robot].track.config)
 
     def _finish(self, read: ReadLog, calibration: Calibration | None) -> None:
         """The end of the log: the last landmarks, and an anchor at the last state."""

@@ -14,7 +14,6 @@ import numpy as np
 from graphslam.core.config import AssociationConfig, Config
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, between, compose, rotation3, wrap
-from graphslam.core.motion_models import Calibration
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, Motion, Step, Trajectory
 from graphslam.estimation.compressed_filter import CompressedBackend
@@ -27,6 +26,7 @@ from graphslam.mapping.robot_candidates import (
     robot_distances,
     robots_in,
 )
+from graphslam.odometry.calibration_jacobian import CalibratedSource
 from graphslam.odometry.online_calibration import observed_information
 from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.robot_state import Causal, RobotState
@@ -78,7 +78,7 @@ def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
     noise = NoiseSoFar(one.steps, one.groups, one.sources, one.config)
     for first in range(0, len(one.steps), BLOCK):
         block = range(first, min(first + BLOCK, len(one.steps)))
-        used = {name: run.track.calibration for name, run in runs.items()}
+        used = {name: CalibratedSource.of(run.track) for name, run in runs.items()}
         if noise.is_due(first):
             found = backend.current_estimate()
             if noise.measure(first, found, tracks):
@@ -286,7 +286,7 @@ def _learn(
     poses: Mapping[str, Array],
     latest: Mapping[str, Array],
     runs: Mapping[str, RobotState],
-    used: Mapping[str, Calibration],
+    used: Mapping[str, CalibratedSource],
     known: Collection[int | str],
     backend: CompressedBackend,
 ) -> None:
@@ -297,7 +297,7 @@ def _learn(
         poses: (3,) estimates of the states that it made.
         latest: (3,) estimates of the states before these.
         runs: the robots, without these states.
-        used: the calibrations that its motions were computed with.
+        used: what its motions were computed with.
         known: landmarks that were there before it.
         backend: after the step.
     """
@@ -317,5 +317,5 @@ def _learn(
         better = run.calibrator.update(
             used[name], motion, between(last, poses[name]), turn @ observed[name] @ turn.T
         )
-        if better is not used[name]:
+        if better is not used[name].calibration:
             run.track.calibration = better

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from graphslam.core.arrays import IntArray
-from graphslam.core.geometry import Array, between, compose, exp, inverse, log, wrap
+from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import HELD_SIGMA
 from graphslam.core.observation_models import transport
 from graphslam.core.record import replace
@@ -27,16 +27,17 @@ from graphslam.core.records import (
 )
 from graphslam.estimation.batch_calibration import uncovered_covs
 from graphslam.estimation.motion_noise import MIN_SIGMA
-from graphslam.odometry.calibration_jacobian import at_estimated_motion
+from graphslam.odometry.calibration_jacobian import (
+    CalibratedSource,
+    at_estimated_motion,
+    by_latency,
+)
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.interpolation import final_at
-from graphslam.odometry.path_sums import LATENCY_STEP_NS
 from graphslam.odometry.preintegration import Track, preintegrate_batch
 from graphslam.perception.sightings import sighting_observation
 from graphslam.pipeline.sighting_batches import transport_batch
 
-#: ns: velocities are the motion from so long before to so long after
-BASELINE_NS = 250_000_000
 #: m of `Track.effort`: where nothing is seen, states are at most so far from each other
 MAX_SPACING_M = 0.5
 
@@ -273,33 +274,8 @@ def calibration_jacobian(
         states: the estimated ones.
     """
     moved = between(states.at(start_ns), states.at(end_ns))
-    d_cal = at_estimated_motion(track, found, moved)
+    d_cal = at_estimated_motion(CalibratedSource.of(track), found.delta, found.d_cal, moved)
     at_base = np.abs(track.mount).max() < HELD_SIGMA  # held, but solutions have rounding
     if track.is_mounted and at_base and not track.has_burst_stamps:
-        change = between(_earlier(states, start_ns), _earlier(states, end_ns)) - moved
-        change[:, 2] = wrap(change[:, 2])
-        d_cal[:, :, -1] = change * (1e9 / LATENCY_STEP_NS)
+        d_cal[:, :, -1] = by_latency(states, start_ns, end_ns)
     return d_cal
-
-
-def _earlier(states: Trajectory, times_ns: IntArray) -> Array:
-    """Poses (n, 3) `LATENCY_STEP_NS` before times, at the mean velocity around them.
-
-    The velocity at the very time would contain the noise of the odometry there, which is in the
-    residual as well.
-    """
-    first, last = states.stamps_ns[0], states.stamps_ns[-1]
-    begin, end = (np.clip(times_ns + dt, first, last) for dt in (-BASELINE_NS, BASELINE_NS))
-    moved = log(between(_interpolated(states, begin), _interpolated(states, end)))
-    step = -LATENCY_STEP_NS / np.maximum(end - begin, 1)[:, None] * moved
-    return compose(states.at(times_ns), exp(step))
-
-
-def _interpolated(states: Trajectory, times_ns: IntArray) -> Array:
-    """Poses (n, 3) on arcs between states."""
-    last = len(states.stamps_ns) - 1
-    i = np.clip(states.stamps_ns.searchsorted(times_ns), 1, last)
-    begin, end = states.stamps_ns[i - 1], states.stamps_ns[i]
-    share = np.clip((times_ns - begin) / np.maximum(end - begin, 1), 0.0, 1.0)
-    twist = log(between(states.poses[i - 1], states.poses[i]))
-    return compose(states.poses[i - 1], exp(share[:, None] * twist))

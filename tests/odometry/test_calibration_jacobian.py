@@ -9,7 +9,7 @@ from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import between, compose, exp
 from graphslam.core.motion_models import rows_of_twists
 from graphslam.core.records import OdometryPose, WheelAngles
-from graphslam.odometry.calibration_jacobian import at_estimated_motion
+from graphslam.odometry.calibration_jacobian import CalibratedSource, at_estimated_motion
 from graphslam.odometry.preintegration import Track
 
 S = 1_000_000_000
@@ -55,7 +55,9 @@ def test_noise_of_odometry_is_not_in_what_calibration_changes(source, mount):
     noisy = track_of(source, twists + NOISE * rng.normal(size=twists.shape), mount)
     ends = np.arange(1, READINGS // STATE_EVERY) * STATE_EVERY * (S // 10)
     without, measured = (track.motions(ends[:-1], ends[1:]) for track in (true, noisy))
-    made = at_estimated_motion(noisy, measured, without.delta)
+    made = at_estimated_motion(
+        CalibratedSource.of(noisy), measured.delta, measured.d_cal, without.delta
+    )
     parameters = slice(0, noisy.increment_parameters + 3 * (mount is not None))
     off = (measured.d_cal - without.d_cal)[:, :, parameters]
     left = (made - without.d_cal)[:, :, parameters]
