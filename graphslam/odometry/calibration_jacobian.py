@@ -85,7 +85,10 @@ def at_estimated_motion(
     d_cal, mount = d_cal.copy(), np.broadcast_to(source.mount, estimated.shape)
     of_base = [compose(compose(mount, motion), inverse(mount)) for motion in (estimated, delta)]
     if p:
-        change = np.subtract(*(source.derivative(log(motion)) for motion in of_base))
+        twists = [log(motion) for motion in of_base]
+        change = np.subtract(*(source.derivative(twist) for twist in twists))
+        # of two turns by nearly half a circle one may be taken for the other way round
+        change[np.abs(twists[0][:, 2] - twists[1][:, 2]) > np.pi] = 0.0
         d_cal[:, :, :p] += lever_to(of_base[1], mount) @ change
     if source.is_mounted:
         d_cal[:, :, p : p + 3] = mounted_motion(of_base[0], mount)[1]

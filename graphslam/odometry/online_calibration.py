@@ -23,6 +23,7 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Motion
 from graphslam.odometry.calibration_jacobian import CalibratedSource, at_estimated_motion
+from graphslam.odometry.increment_sums import Motions
 
 #: weight of the past per state: the memory is about 1 / (1 - FORGETTING_FACTOR) states, so that
 #: parameters may change slowly (tyres warm up)
@@ -40,12 +41,94 @@ NOISE_PRIOR_MOTIONS = 20
 NOTHING_TOLD: Mapping[str, Array] = MappingProxyType({})
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseEvidence:
+    """How noisy odometry is beside what is stated, by tracked motions; that of several adds up.
+
+    ``squares`` and ``expected`` (3,): along each axis the sum of the squared errors of odometry
+    that ``count`` motions show, and what it would be by the noise that is stated; ``stated`` (3,)
+    the sum of the variances stated.
+    """
+
+    squares: Array
+    expected: Array
+    stated: Array
+    count: float
+
+    @classmethod
+    def none(cls) -> "NoiseEvidence":
+        """Nothing is known."""
+        return cls(np.zeros(3), np.zeros(3), np.zeros(3), 0)
+
+    @classmethod
+    def of(
+        cls, miss: Array, white: Array, by_calibration: Array, seen: Array, moved_cov: Array
+    ) -> "NoiseEvidence":
+        """That of motions, each alone: all fields but ``count`` are (n, 3).
+
+        The difference between a motion after tracking and by odometry is P O (z - m): its square is
+        expected to be P O (f Q + C + O⁻¹) O P where the noise is f times as stated.
+
+        Args:
+            miss: (n, 3) these differences.
+            white: (n, 3, 3) the noise Q that is stated.
+            by_calibration: (n, 3, 3) what the error of the calibration adds to it, C.
+            seen: (n, 3, 3) information of landmarks about the motions, O.
+            moved_cov: (n, 3, 3) covariances after tracking, P.
+        """
+        K = moved_cov @ seen
+        explained = _diagonal(K @ (by_calibration @ K.mT + moved_cov))
+        return cls(miss**2 - explained, _diagonal(K @ white @ K.mT), _diagonal(white), 1)
+
+    def with_motions(
+        self, found: "NoiseEvidence", used: Array, past: float = 1.0
+    ) -> "NoiseEvidence":
+        """The same with those motions that are ``used`` (n,); the ``past`` may weigh less."""
+        return NoiseEvidence(
+            past * self.squares + found.squares[used].sum(axis=0),
+            past * self.expected + found.expected[used].sum(axis=0),
+            past * self.stated + found.stated[used].sum(axis=0),
+            past * self.count + float(used.sum()),
+        )
+
+    @property
+    def scale(self) -> Array:
+        """How many times (3,) the stated variances those of odometry are; not less than one."""
+        prior = NOISE_PRIOR_MOTIONS / max(self.count, 1.0) * self.stated
+        scale = (self.squares + prior) / np.maximum(self.expected + prior, 1e-300)
+        return np.asarray(np.maximum(scale, 1.0))
+
+    def applied(self, white: Array) -> Array:
+        """Covariances (n, 3, 3) of noise that is as large as it was found to be."""
+        sigmas = np.sqrt(self.scale)
+        return np.asarray(sigmas[:, None] * white * sigmas)
+
+
+def noisier(motions: Motions, calibration: Calibration, scale: Array) -> Motions:
+    """Motions whose noise has variances that are a factor (3,) larger, as far as it is white."""
+    if np.all(scale == 1.0):
+        return motions
+    sigmas, shared = np.sqrt(scale), motions.d_cal @ calibration.cov @ motions.d_cal.mT
+    cov = sigmas[:, None] * (motions.cov - shared) * sigmas + shared
+    return replace(motions, cov=cov)
+
+
+def _diagonal(matrices: Array) -> Array:
+    """Diagonals (n, 3) of matrices (n, 3, 3)."""
+    return np.asarray(np.einsum("nii->ni", matrices))
+
+
+def _floor(config: OdometryConfig) -> Array:
+    """Covariance (3, 3) of what is wrong with a motion after tracking that odometry cannot tell."""
+    sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
+    return np.diag(np.square(sigmas))
+
+
 class Calibrator:
     """Recursive least squares over one robot's motions."""
 
     def __init__(self, config: OdometryConfig) -> None:
-        sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
-        self._floor = np.diag(np.square(sigmas))
+        self._floor, self._noise = _floor(config), NoiseEvidence.none()
         self._prior: Array | None = None
         self._info: Array = np.zeros((0, 0))
         self._prior_info: Array = np.zeros((0, 0))
@@ -79,13 +162,23 @@ class Calibrator:
             self._names = current.names
         miss = moved - motion.delta
         miss[2] = wrap(miss[2])
-        noise = motion.cov - D @ current.cov @ D.T + self._floor
-        D = at_estimated_motion(source, motion.delta[None], D[None], moved[None])[0]
-        # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
-        W = solve(np.eye(3) + observed @ noise, observed)
-        total = noise + D @ self._prior @ D.T
-        if miss @ solve(total, miss) > OUTLIER_D2 or not W.any():
+        by_calibration = D @ current.cov @ D.T
+        white, floor = motion.cov - by_calibration, self._floor
+        after = solve(np.eye(3) + motion.cov @ observed, motion.cov)
+        each = (one[None] for one in (miss, white, by_calibration, observed, after))
+        found = NoiseEvidence.of(*each)
+        odometry = self._noise.applied(white) + by_calibration
+        if miss @ solve(odometry + floor, miss) > OUTLIER_D2 or not observed.any():
             return current
+        self._noise = self._noise.with_motions(found, np.ones(1, dtype=bool), FORGETTING_FACTOR)
+        noise = self._noise.applied(white)
+        # the likeliest motion, as neither odometry nor the estimate is without error
+        estimated = motion.delta + (noise + by_calibration) @ solve(
+            noise + by_calibration + floor, miss
+        )
+        D = at_estimated_motion(source, motion.delta[None], D[None], estimated[None])[0]
+        # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
+        W = solve(np.eye(3) + observed @ (noise + floor), observed)
         weighted = D.T @ W
         # relative to nominal values: the remaining error plus the present correction
         past = FORGETTING_FACTOR
@@ -127,19 +220,29 @@ class Calibrator:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Learnt:
+    """What a drive so far tells: the calibration, and a factor (3,) on variances of odometry."""
+
+    calibration: Calibration
+    noise_scale: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TrackedMotions:
     """Motions (n) of one robot according to odometry and after tracking.
 
-    ``delta`` (n, 3) and ``cov`` (n, 3, 3) are those of odometry by a ``calibration`` of p
-    parameters, whose covariance is part of ``cov``; ``d_cal`` (n, 3, p) is the derivative by them.
+    ``delta`` (n, 3) and ``cov`` (n, 3, 3) are those of odometry by the calibration of a ``source``,
+    whose covariance is part of ``cov``; ``d_cal`` (n, 3, p) is the derivative by its p parameters.
     ``moved`` (n, 3) and ``moved_cov`` (n, 3, 3) are the estimates from odometry and landmarks
-    together. All along the axes of each start.
+    together. All along the axes of each start. ``noise_scale`` (3,): by how much the variances of
+    the noise in ``cov`` are larger than stated.
     """
 
     delta: Array
     cov: Array
     d_cal: Array
-    calibration: Calibration
+    source: CalibratedSource
+    noise_scale: Array
     moved: Array
     moved_cov: Array
 
@@ -148,43 +251,20 @@ class TrackedMotions:
 class CalibrationEvidence:
     """What motions tell about the p parameters: information (p, p), and that times the mean (p,).
 
-    ``squares`` and ``stated`` (3,): along each axis the sum of squared errors of odometry, and what
-    it would be by the noise that is stated, of ``count`` motions. All of different motions add up.
+    Both are sums over motions. ``noise``: what the same motions tell of the noise of odometry.
     """
 
     information: Array
     vector: Array
-    squares: Array
-    stated: Array
-    count: int
-
-    def __add__(self, other: "CalibrationEvidence") -> "CalibrationEvidence":
-        return CalibrationEvidence(
-            self.information + other.information,
-            self.vector + other.vector,
-            self.squares + other.squares,
-            self.stated + other.stated,
-            self.count + other.count,
-        )
+    noise: NoiseEvidence
 
     @classmethod
     def none(cls, parameters: int) -> "CalibrationEvidence":
         """Nothing is known."""
         nothing = np.zeros(parameters)
-        return cls(np.diag(nothing), nothing, np.zeros(3), np.zeros(3), 0)
+        return cls(np.diag(nothing), nothing, NoiseEvidence.none())
 
-    @property
-    def noise_scale(self) -> Array:
-        """How many times (3,) the stated variances those of odometry are; not less than one."""
-        if not self.count:
-            return np.ones(3)
-        prior = NOISE_PRIOR_MOTIONS / self.count * self.stated
-        scale = (self.squares + prior) / np.maximum(self.stated + prior, 1e-300)
-        return np.asarray(np.maximum(scale, 1.0))
-
-    def with_motions(
-        self, found: TrackedMotions, source: CalibratedSource, config: OdometryConfig
-    ) -> "CalibrationEvidence":
+    def with_motions(self, found: TrackedMotions, config: OdometryConfig) -> "CalibrationEvidence":
         """The same with further tracked motions, by how they differ from those of odometry.
 
         What landmarks alone say about a motion is what the estimate knows beyond odometry:
@@ -192,55 +272,43 @@ class CalibrationEvidence:
         O (z - m) = P⁻¹ (moved - m) for its own measurement z. Motions that are far off (slip) do
         not count.
 
-        Where odometry is noisier than stated, the estimate follows its noise, and a scale of -1
-        would explain that. So the noise is measured first: the squared difference moved - m is
-        expected to be P O (f Q + O⁻¹) O P, where f Q is the noise, f times as stated.
+        Where odometry is noisier than stated, motions after tracking follow its noise, which a
+        scale of -1 would explain. So the noise is measured first, and the derivatives are those at
+        the likeliest motion by it.
         """
         miss = found.moved - found.delta
         miss[:, 2] = wrap(miss[:, 2])
-        D = found.d_cal
+        D, calibration, floor = found.d_cal, found.source.calibration, _floor(config)
         after = np.linalg.inv(found.moved_cov)
         seen = after - np.linalg.inv(found.cov)
         values, axes = np.linalg.eigh(0.5 * (seen + seen.mT))
         seen = (axes * np.maximum(values, 0.0)[:, None]) @ axes.mT
-        told = (after @ miss[:, :, None])[:, :, 0]  # O (z - m)
-        sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
-        floor = np.diag(np.square(sigmas))
-        by_calibration = D @ found.calibration.cov @ D.mT
-        white = found.cov - by_calibration
-        K = found.moved_cov @ seen
-        squares = miss**2 - _diagonal(K @ (by_calibration @ K.mT + found.moved_cov))
-        stated = _diagonal(K @ white @ K.mT)
-        noisier = self
-        for _ in range(GATINGS):
-            scale = np.sqrt(noisier.noise_scale)
-            cov = scale[:, None] * white * scale + by_calibration
-            used = mahalanobis_squared(miss, cov + floor) <= OUTLIER_D2
-            noisier = replace(
-                self,
-                squares=self.squares + squares[used].sum(axis=0),
-                stated=self.stated + stated[used].sum(axis=0),
-                count=self.count + int(used.sum()),
-            )
-        scale = np.sqrt(noisier.noise_scale)
-        white = scale[:, None] * white * scale
-        moved_by = np.linalg.inv(seen + np.linalg.inv(white + by_calibration)) @ told[:, :, None]
-        moved = found.delta + moved_by[:, :, 0]
-        D = at_estimated_motion(source, found.delta, D, moved)
-        gain = np.linalg.inv(np.eye(3) + seen @ (white + floor))[used]
-        W, weighted = gain @ seen[used], gain @ told[used, :, None]
-        D = D[used]
-        vector = D.mT @ (weighted + W @ (D @ found.calibration.mean)[:, :, None])
-        return replace(
-            noisier,
-            information=self.information + (D.mT @ W @ D).sum(axis=0),
-            vector=self.vector + vector.sum(axis=0)[:, 0],
+        by_calibration = D @ calibration.cov @ D.mT
+        sigmas = np.sqrt(found.noise_scale)
+        white = (found.cov - by_calibration) / (sigmas[:, None] * sigmas)
+        shown, noise = (
+            NoiseEvidence.of(miss, white, by_calibration, seen, found.moved_cov),
+            self.noise,
         )
-
-
-def _diagonal(matrices: Array) -> Array:
-    """Diagonals (n, 3) of matrices (n, 3, 3)."""
-    return np.asarray(np.einsum("nii->ni", matrices))
+        for _ in range(GATINGS):
+            cov = noise.applied(white) + by_calibration + floor
+            used = mahalanobis_squared(miss, cov) <= OUTLIER_D2
+            noise = self.noise.with_motions(shown, used)
+        white = noise.applied(white)
+        told = after @ miss[:, :, None]  # O (z - m)
+        # both for landmarks that are off by the floor
+        less = np.linalg.inv(np.eye(3) + seen @ floor)
+        likeliest = np.linalg.inv(less @ seen + np.linalg.inv(white + by_calibration))
+        moved = found.delta + (likeliest @ (less @ told))[:, :, 0]
+        D = at_estimated_motion(found.source, found.delta, D, moved)[used]
+        gain = np.linalg.inv(np.eye(3) + seen @ (white + floor))[used]
+        W, weighted = gain @ seen[used], gain @ told[used]
+        vector = D.mT @ (weighted + W @ (D @ calibration.mean)[:, :, None])
+        return CalibrationEvidence(
+            self.information + (D.mT @ W @ D).sum(axis=0),
+            self.vector + vector.sum(axis=0)[:, 0],
+            noise,
+        )
 
 
 def calibration_from_evidence(known: CalibrationEvidence, prior: Calibration) -> Calibration:

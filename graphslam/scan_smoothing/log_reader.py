@@ -19,11 +19,11 @@ from graphslam.logs.log_set import ReadReport
 from graphslam.pipeline.log_kind import is_scan_log
 
 if TYPE_CHECKING:
-    from graphslam.core.motion_models import Calibration
+    from graphslam.odometry.online_calibration import Learnt
     from graphslam.scan_smoothing.scan_keyframes import ReadItem
 
-#: keyframes or messages, in front of them maybe the log; what is sent is the calibration
-Reading: TypeAlias = Exchange["Calibration", "LogSet | ReadItem | Packed"]
+#: keyframes or messages, in front of them maybe the log; what is sent is the calibration and noise
+Reading: TypeAlias = Exchange["Learnt", "LogSet | ReadItem | Packed"]
 
 #: blocks of keyframes that are read before anything is known of the calibration
 UNCALIBRATED_BLOCKS = 2
@@ -40,7 +40,7 @@ def read_ahead(log: LogSet, config: Config) -> Reading:
 def open_ahead(open_log: Callable[[], LogSet], config: Config) -> Reading:
     """First the log itself; then its keyframes if `is_scan_log` holds for it, else its messages."""
 
-    def opened() -> Generator[LogSet | ReadItem | Packed, Calibration | None, None]:
+    def opened() -> Generator[LogSet | ReadItem | Packed, Learnt | None, None]:
         log = open_log()
         yield log
         if is_scan_log(log, config):
@@ -80,9 +80,7 @@ def _received(reading: Reading, batches: int) -> Iterator[Message | ReadReport]:
         yield from unpacked(batch)
 
 
-def _keyframes(
-    log: LogSet, config: Config
-) -> Generator[LogSet | ReadItem, Calibration | None, None]:
+def _keyframes(log: LogSet, config: Config) -> Generator[LogSet | ReadItem, Learnt | None, None]:
     from graphslam.scan_smoothing.scan_keyframes import read_keyframes  # noqa: PLC0415 (see above)
 
     return read_keyframes(log, config, UNCALIBRATED_BLOCKS)

@@ -26,6 +26,8 @@ from graphslam.multi_robot.robot_detection import COMPARED_SCANS, without_return
 from graphslam.odometry.calibration_jacobian import CalibratedSource
 from graphslam.odometry.gap_bridging import with_bridged_gaps
 from graphslam.odometry.laser_odometry import with_laser_odometry
+from graphslam.odometry.noise_estimation import is_stated
+from graphslam.odometry.online_calibration import Learnt, noisier
 from graphslam.odometry.scan_odometry import (
     MIN_POINTS,
     suspect_motions,
@@ -64,6 +66,7 @@ class KeyframeBlock:
     ``start_ns``: time of the first state of the robot. ``pairs``: scans of the first laser that
     `MotionChecker` has to compare, ``last``: the number of its last keyframe, if there is one.
     ``source`` is what the motions are made with, ``prior`` its calibration before any data.
+    ``noise_scale`` (3,): by how much variances of the noise of odometry are larger than stated.
     ``messages``: number of messages read so far; ``seconds`` that all this took.
     """
 
@@ -72,6 +75,7 @@ class KeyframeBlock:
     pairs: Sequence[ScanPair]
     last: int | None
     source: CalibratedSource
+    noise_scale: Array
     prior: Calibration
     messages: int
     seconds: float
@@ -106,11 +110,11 @@ ReadItem = KeyframeBlock | ReadLog | AwaitCalibration
 
 def read_keyframes(
     log: LogSet, config: Config, uncalibrated: int
-) -> Generator[LogSet | ReadItem, Calibration | None, None]:
+) -> Generator[LogSet | ReadItem, Learnt | None, None]:
     """The keyframes of the only robot of a log, and last a `ReadLog`.
 
-    What is sent is the calibration for later motions. After ``uncalibrated`` blocks it is waited
-    for: before, some of what follows is read, then comes a `AwaitCalibration`.
+    What is sent is the calibration for later motions, and their noise. After ``uncalibrated``
+    blocks it is waited for: before, some of what follows is read, then comes a `AwaitCalibration`.
     """
     reader = _Reader(log, with_noted_keyframes(log, config), log.robots[0])
     for number, block in enumerate(reader.blocks(), 1):
@@ -119,7 +123,7 @@ def read_keyframes(
             reader.read_ahead()
             found = yield AwaitCalibration()
         if found is not None:
-            reader.run.track.calibration = found
+            reader.learn(found)
     yield reader.read_log()
 
 
@@ -172,6 +176,7 @@ class _Reader:
         self._lasers = {s: _Laser(RobotState(self.run.track) if s else self.run) for s in sensors}
         self._matches_scans = config.odometry.scan_matching != "off"
         self._keyframes = KeyframeSelector(config.keyframe)
+        self._noise_scale = np.ones(3)
         self._state_ns: int | None = None
         self._state_of = ""  # the laser whose state is the last one
         self._consecutive = ConsecutiveScans(self.run.track, config.scan_matching)
@@ -183,6 +188,12 @@ class _Reader:
         self._seconds: dict[str, float] = defaultdict(float)
         self._span_ns = 1 << 63, 0
         self._messages = _Messages(iter(log.messages(TRUE_RECORDS, all_lasers=True)))
+
+    def learn(self, found: Learnt) -> None:
+        """Later motions are by this calibration, and as noisy where nobody says how noisy."""
+        self.run.track.calibration = found.calibration
+        if not is_stated(self.run.track):
+            self._noise_scale = found.noise_scale
 
     def read_ahead(self) -> None:
         """Read some of the messages that later blocks are made of."""
@@ -230,7 +241,7 @@ class _Reader:
             source = CalibratedSource.of(track)
             keyframes, pairs, last = self._of_block(block)
             yield KeyframeBlock(
-                first_ns, keyframes, pairs, last, source, track.prior,
+                first_ns, keyframes, pairs, last, source, self._noise_scale, track.prior,
                 self._counts["messages"], time.perf_counter() - began,
             )  # fmt: skip
 
@@ -349,6 +360,7 @@ class _Reader:
         ends = np.array([self._state_ns, *(s.time_ns for s in used)], dtype=np.int64)
         with timed(self._seconds, "motions"):
             many = self.run.track.motions(ends[:-1], ends[1:])
+            many = noisier(many, self.run.track.calibration, self._noise_scale)
         return [
             many.one(k, int(ends[k]), int(ends[k + 1])) if ends[k + 1] > ends[k] else None
             for k in range(len(used))

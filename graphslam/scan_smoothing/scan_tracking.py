@@ -19,6 +19,7 @@ from graphslam.logs import LogSet
 from graphslam.mapping.local_tracking import LocalTracker
 from graphslam.odometry.online_calibration import (
     CalibrationEvidence,
+    Learnt,
     TrackedMotions,
     calibration_from_evidence,
 )
@@ -133,7 +134,7 @@ class ScanLog(TrackedLog):
                         known = self._evidence(item, moved, known)
                         calibration = calibration_from_evidence(known, item.prior)
                 # the next block is being read; this is for the one after it
-                reading.send(calibration)
+                reading.send(known and Learnt(calibration, known.noise.scale))
                 if moved:
                     took = item.seconds + time.perf_counter() - began
                     self.step_ms += [1e3 * took / len(moved)] * len(moved)
@@ -203,11 +204,12 @@ class ScanLog(TrackedLog):
             np.array([m.delta for m in motions]),
             np.array([m.cov for m in motions]),
             np.array([m.d_delta_d_calibration for m in motions]),
-            block.source.calibration,
+            block.source,
+            block.noise_scale,
             np.array(moved),
             np.array(covs),
         )
-        return known.with_motions(found, block.source, self.runs[self._robot].track.config)
+        return known.with_motions(found, self.runs[self._robot].track.config)
 
     def _finish(self, read: ReadLog, calibration: Calibration | None) -> None:
         """The end of the log: the last landmarks, and an anchor at the last state."""

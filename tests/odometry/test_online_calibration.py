@@ -11,6 +11,7 @@ from graphslam.core.geometry import between, compose, exp
 from graphslam.core.motion_models import Calibration, wheel_twist
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, OdometryIncrement, OdometryPose, WheelAngles
+from graphslam.odometry.calibration_jacobian import CalibratedSource, at_estimated_motion
 from graphslam.odometry.online_calibration import (
     FORGETTING_FACTOR,
     MIN_SIGMA_SHARE,
@@ -97,9 +98,8 @@ class Drive:
         for start, end in zip(self.states[:-1], self.states[1:], strict=True):
             motion = self.track.motion(int(start), int(end))
             moved = self.moved(start, end)
-            self.track.calibration = self.calibrator.update(
-                self.track.calibration, motion, moved, PLENTY
-            )
+            source = CalibratedSource.of(self.track)
+            self.track.calibration = self.calibrator.update(source, motion, moved, PLENTY)
         return self.calibrator.summary()
 
 
@@ -129,15 +129,25 @@ def test_what_is_found_lies_within_its_sigmas():
     assert np.all(total / n > 0.1)  # nor are the sigmas so wide that they say nothing
 
 
+def derivative_at_likeliest(source, motion, moved):
+    """Where odometry, by its covariance, and the estimate, by `FLOOR`, together put the motion."""
+    share = motion.cov @ np.linalg.inv(motion.cov + np.diag(np.square(FLOOR)))
+    likeliest = motion.delta + share @ (moved - motion.delta)
+    delta, d_cal = motion.delta[None], motion.d_delta_d_calibration[None]
+    return at_estimated_motion(source, delta, d_cal, likeliest[None])[0]
+
+
 def test_one_step_is_the_information_filter_by_hand():
     """Prior and motion, each by its own covariance: the motion's without its calibration part,
     which is what is being learned, plus what the estimate of a motion is off by."""
     drive = Drive(weaving(100, np.random.default_rng(1)), mounted=False)
     prior, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
-    moved = motion.delta + np.array([0.02, 0.01, -0.01])
-    after = drive.calibrator.update(prior, motion, moved, PLENTY)
+    moved = motion.delta + np.array([0.01, 0.005, -0.005])
+    source = CalibratedSource.of(drive.track)
+    after = drive.calibrator.update(source, motion, moved, PLENTY)
     D = motion.d_delta_d_calibration
     noise = motion.cov - D @ prior.cov @ D.T + np.diag(np.square(FLOOR))
+    D = derivative_at_likeliest(source, motion, moved)
     info = np.linalg.inv(prior.cov) + D.T @ np.linalg.solve(noise, D)
     expected = np.linalg.solve(info, D.T @ np.linalg.solve(noise, moved - motion.delta))
     np.testing.assert_allclose(after.mean, expected, rtol=1e-7)
@@ -148,7 +158,8 @@ def test_one_step_is_the_information_filter_by_hand():
 def test_going_on_from_a_joint_estimate_is_the_information_filter_by_hand():
     """What was learned before is replaced by the estimate of all states so far: the next motion
     adds to its information, of which `FORGETTING_FACTOR` and the prior's share remain."""
-    drive = Drive(weaving(1000, np.random.default_rng(1)), mounted=False)
+    # without errors, so that odometry is as noisy as stated
+    drive = Drive(weaving(1000, np.random.default_rng(1)), NOTHING, CENTRED, mounted=False)
     prior = drive.track.prior
     drive.learn()
     found = Calibration(prior.names, np.full(3, 0.01), 0.09 * prior.cov)
@@ -157,10 +168,11 @@ def test_going_on_from_a_joint_estimate_is_the_information_filter_by_hand():
     np.testing.assert_allclose(used.cov, (0.09 + MIN_SIGMA_SHARE**2) * prior.cov, rtol=1e-12)
     drive.track.calibration = used
     motion = drive.track.motion(SECOND, 3 * SECOND)
-    miss = np.array([0.002, 0.001, -0.001])
-    after = drive.calibrator.update(used, motion, motion.delta + miss, PLENTY)
+    miss, source = np.array([0.002, 0.001, -0.001]), CalibratedSource.of(drive.track)
+    after = drive.calibrator.update(source, motion, motion.delta + miss, PLENTY)
     D = motion.d_delta_d_calibration
     noise = motion.cov - D @ used.cov @ D.T + np.diag(np.square(FLOOR))
+    D = derivative_at_likeliest(source, motion, motion.delta + miss)
     past, known = FORGETTING_FACTOR, np.linalg.inv(found.cov)
     info = past * known + (1 - past) * np.linalg.inv(prior.cov) + D.T @ np.linalg.solve(noise, D)
     vector = past * known @ found.mean + D.T @ np.linalg.solve(noise, miss + D @ found.mean)
@@ -186,7 +198,8 @@ def test_wheels_of_unequal_size_are_found():
     for k in range(0, n, 10):
         motion = track.motion(k * PERIOD_NS, (k + 10) * PERIOD_NS)
         moved = between(true[k], true[k + 10]) + rng.normal(0, FLOOR)
-        track.calibration = calibrator.update(track.calibration, motion, moved, PLENTY)
+        source = CalibratedSource.of(track)
+        track.calibration = calibrator.update(source, motion, moved, PLENTY)
     found = calibrator.summary()
     errors = {"wheel_radius_left_m": 4e-3, "wheel_radius_right_m": 2e-3, "axle_m": 0.01}
     assert set(found) == set(errors)
@@ -203,9 +216,9 @@ def test_a_jump_of_the_estimate_teaches_nothing(jump):
     drive = Drive(weaving(1000, np.random.default_rng(1)))
     before = drive.learn()
     motion = drive.track.motion(2 * SECOND, 2 * SECOND + STATE_NS)
-    current = drive.track.calibration
+    current, source = drive.track.calibration, CalibratedSource.of(drive.track)
     moved = drive.moved(2 * SECOND, 2 * SECOND + STATE_NS) + jump
-    assert drive.calibrator.update(current, motion, moved, PLENTY) is current
+    assert drive.calibrator.update(source, motion, moved, PLENTY) is current
     assert drive.calibrator.summary() == before
 
 
@@ -221,7 +234,8 @@ def test_headings_are_compared_the_short_way_round():
         track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.array([0, 0, phi])))
     motion = track.motion(0, 49 * PERIOD_NS)
     calibrator = Calibrator(OdometryConfig())
-    after = calibrator.update(track.calibration, motion, np.array([0, 0, -np.pi + 0.01]), PLENTY)
+    source, moved = CalibratedSource.of(track), np.array([0, 0, -np.pi + 0.01])
+    after = calibrator.update(source, motion, moved, PLENTY)
     assert 0 < after.mean[1] < 0.02 / np.pi
 
 
@@ -247,10 +261,11 @@ def test_turning_in_place_shows_the_lasers_place_and_not_its_yaw():
     assert found["laser_x_m"][2] and found["laser_y_m"][2] and found["rotation_scale"][2]
     for name in ("laser_x_m", "laser_y_m"):
         assert abs(found[name][0] - LASER[name]) < found[name][1]
+    # while the place is not known, what it does looks like a motion of the base by a millimetre
     for name in ("translation_scale", "drift_rad_per_m"):
         value, sigma, observable = found[name]
-        assert value == pytest.approx(0.0, abs=1e-9) and not observable, name
-        assert sigma == pytest.approx(PRIOR[name], rel=1e-9), name
+        assert value == pytest.approx(0.0, abs=1e-3 * sigma) and not observable, name
+        assert sigma == pytest.approx(PRIOR[name], rel=1e-3), name
 
 
 def test_what_was_learned_is_not_forgotten_below_the_prior():
@@ -294,7 +309,8 @@ def test_without_landmarks_nothing_is_learned():
     """The estimate is odometry then: agreement with itself is no evidence."""
     drive = Drive(weaving(100, np.random.default_rng(1)))
     current, motion = drive.track.calibration, drive.track.motion(SECOND, 3 * SECOND)
-    after = drive.calibrator.update(current, motion, motion.delta, np.zeros((3, 3)))
+    source = CalibratedSource.of(drive.track)
+    after = drive.calibrator.update(source, motion, motion.delta, np.zeros((3, 3)))
     np.testing.assert_array_equal(after.mean, current.mean)
     np.testing.assert_array_equal(after.cov, current.cov)
 
@@ -307,9 +323,8 @@ def test_a_corridor_does_not_show_the_scale_of_the_path():
         motion = drive.track.motion(int(start), int(end))
         moved = drive.moved(start, end)
         moved[0] = motion.delta[0]
-        drive.track.calibration = drive.calibrator.update(
-            drive.track.calibration, motion, moved, walls
-        )
+        source = CalibratedSource.of(drive.track)
+        drive.track.calibration = drive.calibrator.update(source, motion, moved, walls)
     found = drive.calibrator.summary()
     assert found["translation_scale"][1] == pytest.approx(PRIOR["translation_scale"], rel=1e-4)
     assert found["drift_rad_per_m"][2] and not found["translation_scale"][2]
@@ -352,9 +367,10 @@ def test_given_increments_are_left_alone():
         step = np.array([0.5, 0, 0.1])
         track.add(OdometryIncrement("r", end, end, start, step, 1e-4 * np.eye(3)))
     calibrator, current = Calibrator(OdometryConfig()), track.calibration
+    source = CalibratedSource.of(track)
     for k in range(20):
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
-        assert calibrator.update(current, motion, np.array([0.6, 0.05, 0.2]), PLENTY) is current
+        assert calibrator.update(source, motion, np.array([0.6, 0.05, 0.2]), PLENTY) is current
     assert calibrator.summary() == {}
     np.testing.assert_array_equal(track.mount, 0)
 
@@ -365,14 +381,17 @@ def test_a_robot_that_stands_teaches_nothing():
     for k in range(100):
         track.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, np.ones(3)))
     calibrator, current = Calibrator(OdometryConfig()), track.calibration
+    source = CalibratedSource.of(track)
     for k in range(4):
         motion = track.motion(k * SECOND, (k + 1) * SECOND)
-        assert calibrator.update(current, motion, np.array([0.01, 0.0, 0.005]), PLENTY) is current
+        assert calibrator.update(source, motion, np.array([0.01, 0.0, 0.005]), PLENTY) is current
     assert calibrator.summary() == {}
 
 
 def calibrated(found, prior):
-    return calibration_from_evidence(CalibrationEvidence.of(found, OdometryConfig()), prior)
+    nothing = CalibrationEvidence.none(len(prior.mean))
+    known = nothing.with_motions(found, OdometryConfig())
+    return calibration_from_evidence(known, prior)
 
 
 # ------------------------------------------------------------ all motions at once
@@ -395,7 +414,8 @@ def tracked_motions(drive, landmark_cov, rng, calibration=None):
         np.array([m.delta for m in motions]),
         np.array([m.cov for m in motions]),
         np.array([m.d_delta_d_calibration for m in motions]),
-        track.calibration,
+        CalibratedSource.of(track),
+        np.ones(3),
         np.array(moved),
         np.array(covs),
     )
@@ -429,7 +449,8 @@ def test_scale_errors_are_found_from_tracked_motions_to_their_sigmas(landmark_co
 
 def test_what_is_found_does_not_depend_on_the_calibration_that_motions_had():
     """Evidence from motions by a calibration that is right already says the same as from motions
-    without any, to a tenth of a sigma (the odometry's covariance changes with it)."""
+    without any, to 0.4 sigma: derivatives at the estimated motion are too large by the error of the
+    scale there, 0.04 of 0.04, and a sigma is 0.0045."""
     prior, found = None, []
     for known in (0.0, 1.0):
         rng = np.random.default_rng(4)
@@ -438,7 +459,7 @@ def test_what_is_found_does_not_depend_on_the_calibration_that_motions_had():
         used = replace(prior, mean=known * np.array(list(SCALES.values())))
         found.append(calibrated(tracked_motions(drive, 1e-2 * POOR, rng, used), prior))
     sigmas = np.sqrt(np.diag(without_margin(found[0], prior)))
-    assert np.all(np.abs(found[0].mean - found[1].mean) < 0.1 * sigmas)
+    assert np.all(np.abs(found[0].mean - found[1].mean) < 0.4 * sigmas)
 
 
 def test_without_landmarks_and_without_motions_the_prior_stays():
@@ -457,10 +478,87 @@ def test_a_slipping_motion_does_not_count():
     found.moved[7, 0] -= 0.5
     other = np.delete(np.arange(len(found.moved)), 7)
     clean = TrackedMotions(
-        found.delta[other], found.cov[other], found.d_cal[other], drive.track.calibration,
+        found.delta[other], found.cov[other], found.d_cal[other], found.source, np.ones(3),
         found.moved[other], found.moved_cov[other],
     )  # fmt: skip
     prior = drive.track.calibration
     np.testing.assert_allclose(
         calibrated(found, prior).mean, calibrated(clean, prior).mean, rtol=0, atol=1e-12
     )
+
+
+# ------------------------------------------------------------ odometry noisier than stated
+
+
+def noisy(n, rng, times):
+    """Twists of a robot that drives straight, and what odometry with noise says of them: that of
+    its heading has ``times`` the variance that the settings state."""
+    twists = straight(n)
+    noise = np.sqrt(times * OdometryConfig().k_phi_m * twists[:, 0]) * rng.normal(size=n)
+    return twists, twists + noise[:, None] * [0.0, 0.0, 1.0]
+
+
+def driven(seed, times):
+    """A drive as `noisy` says, without errors of calibration."""
+    twists, said = noisy(1200, np.random.default_rng(seed), times)
+    drive = Drive(said, NOTHING, CENTRED, mounted=False)
+    truth = chain(twists)
+    drive._truth = Track(OdometryConfig(), RobotConfig())
+    for k, pose in enumerate(truth):
+        drive._truth.add(OdometryPose("r", k * PERIOD_NS, k * PERIOD_NS, pose))
+    return drive
+
+
+#: landmarks that show a motion to 2 mm and 2 mrad
+GOOD = np.square([0.002, 0.002, 0.002])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_of_a_straight_drive_is_no_scale_of_turning(seed):
+    """Where nothing but noise turns the odometry a scale of -1 would explain all of it: of 27 times
+    the stated variance, as wheels on carpet have, it was -0.4. The prior's sigma is 0.04, and
+    nothing was seen of the scale, so it stays within one."""
+    drive = driven(seed, 27.0)
+    prior = drive.track.calibration
+    found = calibrated(tracked_motions(drive, GOOD, np.random.default_rng(seed)), prior)
+    assert abs(found.mean[1]) < PRIOR["rotation_scale"]
+
+
+@pytest.mark.parametrize("times", [1.0, 9.0, 27.0])
+def test_noise_of_odometry_is_measured(times):
+    """That of a motion over half a second: the floor is once in it, and not noisier. 120 motions
+    tell the variance to 13 %, three of its sigmas."""
+    drive = driven(7, times)
+    tracked = tracked_motions(drive, GOOD, np.random.default_rng(7))
+    known = CalibrationEvidence.none(3).with_motions(tracked, OdometryConfig())
+    stated = OdometryConfig().k_phi_m * 0.25
+    expected = (times * stated + OdometryConfig().floor_sigma_rad ** 2) / (
+        stated + OdometryConfig().floor_sigma_rad ** 2
+    )
+    assert known.noise.scale[2] == pytest.approx(max(expected, 1.0), rel=0.4)
+    assert known.noise.scale[0] == 1.0  # along the path it is as stated or less
+
+
+def test_a_drive_by_noise_that_was_learnt_measures_the_same_noise():
+    """The scale is that of what is stated, whatever scale the motions had already."""
+    drive, found = driven(3, 27.0), []
+    for scale in (np.ones(3), np.array([1.0, 1.0, 9.0])):
+        made = tracked_motions(drive, GOOD, np.random.default_rng(3))
+        shared = made.d_cal @ made.source.calibration.cov @ made.d_cal.mT
+        white = np.sqrt(scale)[:, None] * (made.cov - shared) * np.sqrt(scale)
+        made = replace(made, cov=white + shared, noise_scale=scale)
+        # tracked anew: the same landmarks, other odometry
+        seen = np.linalg.inv(np.diag(GOOD))
+        z = (
+            made.delta
+            + (
+                np.diag(GOOD)
+                @ np.linalg.inv(made.moved_cov)
+                @ (made.moved - made.delta)[:, :, None]
+            )[:, :, 0]
+        )
+        P = np.linalg.inv(np.linalg.inv(made.cov) + seen)
+        moved = made.delta + (P @ seen @ (z - made.delta)[:, :, None])[:, :, 0]
+        made = replace(made, moved=moved, moved_cov=P)
+        found.append(CalibrationEvidence.none(3).with_motions(made, OdometryConfig()).noise.scale)
+    np.testing.assert_allclose(found[0], found[1], rtol=0.1)
