@@ -28,9 +28,6 @@ from graphslam.scan_smoothing.localisation import (
 from graphslam.scan_smoothing.path_closing import PLACE_COV
 from graphslam.scan_smoothing.scan_tracking import TrackedLog
 
-#: m: of a visit, or a known map, that lies where it was placed
-NOT_DISPLACED = np.zeros(2)
-
 
 def doubt_again(
     scan_log: TrackedLog, states: Mapping[str, Trajectory], by: Mapping[str, Array]
@@ -61,11 +58,12 @@ def _doubts(
     anchors = {name: np.array(scan_log.paths[name].anchors) for name in states}
     submaps, _ = submaps_at(anchors, states, scan_log.keyframe_scans, scan_log.config)
     known_map = scan_log.known.known_map
-    before = [] if known_map is None else [_Placed(known_map.places)]
+    stays = np.zeros(2)
+    before = [] if known_map is None else [_Placed(known_map.places, stays)]
     found = {}
     for name in sorted(states, key=lambda name: (int(states[name].stamps_ns[0]), name)):
         own = [submap for submap in submaps if submap.state[0] == name]
-        visit = _Placed(own, by.get(name, NOT_DISPLACED))
+        visit = _Placed(own, by.get(name, stays))
         seen = latest_places([place for one in reversed(before) for place in one.places])
         placed = support(seen, own, visit.pushed_since(before))
         if placed.confirmed.any():
@@ -79,7 +77,7 @@ class _Placed:
     """Places of a visit, or of a known map, and ``by`` how much it was displaced (2,), m."""
 
     places: Sequence[SubmapPose]
-    by: Array = NOT_DISPLACED
+    by: Array
 
     def pushed_since(self, before: Iterable["_Placed"]) -> list[Array]:
         """By how much it was displaced against each of those before it, where that is not 0."""
