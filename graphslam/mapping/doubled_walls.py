@@ -79,9 +79,13 @@ class Displacement(NamedTuple):
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether walls stand twice, nearly as many as stand once: one of two groups was moved."""
-        is_wall = self.wide_m > LEAST_WIDE_M or self.faced_m > LEAST_TWICE_M
-        return is_wall and self._is_above(DOUBT_FACTOR)
+        """Whether walls stand twice, nearly as many as stand once: one of two groups was moved.
+
+        Of one plane only if hardly any stand once: that is easily a single thing that was moved.
+        """
+        if self.wide_m > LEAST_WIDE_M:
+            return self._is_above(DOUBT_FACTOR)
+        return self.faced_m > LEAST_TWICE_M and self._is_above(CLEAR_FACTOR)
 
     @property
     def is_clear(self) -> bool:

@@ -113,6 +113,14 @@ def test_one_wall_seen_twice_from_one_side_is_a_doubt(turned, side, doubt):
     assert not found.is_clear
 
 
+def test_one_row_that_was_moved_in_front_of_walls_that_stay_is_no_doubt():
+    """Of a room's walls across the direction in which it was moved, one is in sight: 3 m of it."""
+    row, wall = (2, 0.1, 0, 4), (2, 6, 0, 3)
+    found = compare(pieces((2, 0, 0, 4), wall, side=1), pieces(row, wall, side=1))
+    assert found.faced_m == 4.0 and found.once_m == 3.0
+    assert not found.is_doubtful
+
+
 def test_a_wall_is_known_to_be_seen_from_inside_the_room():
     """By where the robot was, whichever way the wall's landmark points."""
     for walls in (WALLS[:1], [((5, 0, np.pi), 4.0)]):
