@@ -21,6 +21,9 @@ from graphslam.core.geometry import Array, transform, wrap
 FIT_PROBABILITY = 0.9999
 #: m: points that lie closer together (root mean square) tell no direction
 COINCIDENT_M = 1e-9
+#: share of a measurement's variance by which a solution must know more than it for others to say
+#: anything along that axis
+LEAST_TOLD = 1e-3
 #: an alternative with more than this share of the best one's support leaves a decision open
 RIVAL_SHARE = 0.5
 #: the same for squared Mahalanobis distances: an alternative at most this much farther off is a
@@ -99,6 +102,31 @@ def leave_one_out_distances(information: Array, r: Array) -> Array:
     n, d = r.shape
     own = information.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
     return mahalanobis_squared((information @ r.ravel()).reshape(n, d), own)
+
+
+def distances_from_others(r: Array, R: Array, S: Array, inflation: float = 1.0) -> Array:
+    """Squared Mahalanobis distances (n,) of measurements from what all others in a solution say.
+
+    A measurement draws the solution to itself: one that is wrong where little else is known has
+    hardly a residual. So it is compared with the solution without it (deleted residuals: R. Cook
+    and S. Weisberg, Residuals and Influence in Regression, 1982). Along an axis in which the
+    solution has a share s of the measurement's variance, a residual of r sigmas is r / (1 - s)
+    sigmas without it, and what is measured is known to s / (1 - s) variances.
+
+    Args:
+        r: (n, d) residuals in the solution.
+        R: (n, d, d) covariances of the measurements.
+        S: (n, d, d) covariances of what they measure, in the solution; along the axes of R.
+        inflation: factor on the covariances of what the others say.
+    """
+    L = np.linalg.cholesky(R)
+    half = np.linalg.solve(L, S)
+    share, axes = np.linalg.eigh(np.linalg.solve(L, half.mT))
+    sigmas = (axes.mT @ np.linalg.solve(L, r[..., None]))[..., 0]
+    left = 1.0 - share
+    told = left > LEAST_TOLD  # else the others say nothing, and nothing is off
+    left = np.where(told, left, 1.0)
+    return np.asarray((sigmas**2 * told / (left * (left + inflation * share))).sum(axis=-1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

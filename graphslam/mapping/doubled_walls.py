@@ -20,10 +20,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from graphslam.core.arrays import BoolArray, IntArray
-from graphslam.core.geometry import Array, unit_vectors
+from graphslam.core.geometry import Array, between, unit_vectors
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.mapping.building import of_building
-from graphslam.mapping.landmark_map import Entry, LandmarkMap
+from graphslam.mapping.landmark_map import Entry, LandmarkMap, observed_from
 from graphslam.mapping.wall_observations import wall_observations, walls_seen
 
 #: m: walls are compared in pieces of at most and at least this length
@@ -35,22 +35,26 @@ REACH_M, STEP_M, ROUNDS = 0.6, 0.02, 3
 #: m: what is displaced by less is tied, and solved, where it belongs
 LEAST_M = 0.04
 #: m: of walls that stand twice, at least, and how wide an area they enclose: one wall alone may be
-#: seen from both of its sides
+#: seen from both of its sides. Seen from one it stands twice, or is a long row of cupboards
 LEAST_TWICE_M, LEAST_WIDE_M = 3.0, 1.0
 #: how many times as long as what lies on others only as it is must be what does so only if
 #: displaced: for a doubt, and for a displacement. In the simulated office on five days and in
 #: Intel's thirds nothing does; where all furniture of the lab was pushed alike nearly all
 DOUBT_FACTOR, CLEAR_FACTOR = 0.5, 4.0
-#: in place of a visit's name, of what an earlier map knows
-_BEFORE = ""
+#: middle (2,) m, direction rad, length m and side of a piece, see `Pieces`
+_Piece = tuple[Array, float, float, float]
 
 
 class Pieces(NamedTuple):
-    """Pieces (n) of walls: middles (n, 2) m, directions (n,) rad and lengths (n,) m."""
+    """Pieces (n) of walls: middles (n, 2) m, directions (n,) rad and lengths (n,) m.
+
+    ``side`` (n,): 1 if it was seen from where its normal points, -1 from behind, 0 not known.
+    """
 
     at: Array
     direction: Array
     length: Array
+    side: Array
 
     @property
     def ends(self) -> Array:
@@ -63,29 +67,34 @@ class Displacement(NamedTuple):
     """What lays the walls of a visit on those seen before, ``by`` (2,) m in the world.
 
     ``twice_m``: length of walls that lie on others only then, ``once_m``: only as they are;
-    ``wide_m``: how wide what stands twice is, across the direction in which it extends farthest.
+    ``wide_m``: how wide what stands twice is, across the direction in which it extends farthest;
+    ``faced_m``: length of what both visits saw from the same side of it.
     """
 
     by: Array
     twice_m: float
     once_m: float
     wide_m: float
+    faced_m: float
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether walls stand twice, nearly as many as stand once: one of two groups was moved."""
-        return self._is_above(DOUBT_FACTOR)
+        """Whether walls stand twice, nearly as many as stand once: one of two groups was moved.
+
+        Of one plane only if hardly any stand once: that is easily a single thing that was moved.
+        """
+        if self.wide_m > LEAST_WIDE_M:
+            return self._is_above(DOUBT_FACTOR)
+        return self.faced_m > LEAST_TWICE_M and self._is_above(CLEAR_FACTOR)
 
     @property
     def is_clear(self) -> bool:
-        """Whether the walls stand twice, and hardly any once."""
-        return self._is_above(CLEAR_FACTOR)
+        """Whether the walls stand twice, in more than one plane, and hardly any once."""
+        return self.wide_m > LEAST_WIDE_M and self._is_above(CLEAR_FACTOR)
 
     def _is_above(self, factor: float) -> bool:
         return bool(
-            np.hypot(*self.by) > LEAST_M
-            and self.twice_m > max(LEAST_TWICE_M, factor * self.once_m)
-            and self.wide_m > LEAST_WIDE_M
+            np.hypot(*self.by) > LEAST_M and self.twice_m > max(LEAST_TWICE_M, factor * self.once_m)
         )
 
 
@@ -100,7 +109,7 @@ def displacements(
     if not landmarks.known and len(estimate.states) < 2:
         return {}
     found = {}
-    (_, before), *visits = _building(steps, estimate, landmarks)
+    before, visits = _building(steps, estimate, landmarks)
     for visit, own in visits:
         displacement = compare(own, before)
         placed = own
@@ -114,16 +123,16 @@ def displacements(
 
 def compare(own: Pieces, before: Pieces) -> Displacement | None:
     """What lays pieces on those seen before; None if they are nowhere near."""
-    which, normal, off = _beside(own, before)
+    which, normal, off, is_faced = _beside(own, before)
     if not len(which):
         return None
     first = np.flatnonzero(np.diff(which, prepend=-1))
     beside = Pieces(*(column[which[first]] for column in own))
     length = beside.length
 
-    def on(by: Array) -> BoolArray:
-        """Which pieces (m,) lie on one that was seen before, displaced by (2,)."""
-        near = np.abs(off - normal @ by) < ON_M
+    def on(by: Array, others: BoolArray | bool = True) -> BoolArray:
+        """Which pieces (m,) lie on one of some that were seen before, displaced by (2,)."""
+        near = (np.abs(off - normal @ by) < ON_M) & others
         return np.asarray(np.logical_or.reduceat(near, first), dtype=np.bool_)
 
     by = _best(normal, off, first, length)
@@ -134,7 +143,9 @@ def compare(own: Pieces, before: Pieces) -> Displacement | None:
     here, there = on(np.zeros(2)), on(by)
     twice = there & ~here
     wide_m = _width(beside.ends[twice].reshape(-1, 2))
-    return Displacement(by, float(length[twice].sum()), float(length[here & ~there].sum()), wide_m)
+    lengths = (float(length[which].sum()) for which in (here & ~there, twice & on(by, is_faced)))
+    once_m, faced_m = lengths
+    return Displacement(by, float(length[twice].sum()), once_m, wide_m, faced_m)
 
 
 def _width(points: Array) -> float:
@@ -159,12 +170,12 @@ def _best(normal: Array, off: Array, first: IntArray, length: Array) -> Array:
     return by
 
 
-def _beside(own: Pieces, before: Pieces) -> tuple[IntArray, Array, Array]:
+def _beside(own: Pieces, before: Pieces) -> tuple[IntArray, Array, Array, BoolArray]:
     """Pairs (m) of pieces that may be one, sorted by the own one.
 
     Returns:
-        Numbers of the own ones (m,), their normals (m, 2), and how far across they have to be
-        displaced to lie on the others (m,), m.
+        Numbers of the own ones (m,), their normals (m, 2), how far across they have to be displaced
+        to lie on the others (m,), m, and whether both were seen from the same side (m,).
     """
     near = cKDTree(own.at).query_ball_tree(cKDTree(before.at), PIECE_M + REACH_M)
     i = np.repeat(np.arange(len(near)), [len(found) for found in near])
@@ -179,18 +190,21 @@ def _beside(own: Pieces, before: Pieces) -> tuple[IntArray, Array, Array]:
     shared = 0.5 * (own.length[i] + before.length[j]) - along
     may = np.abs(off) < REACH_M + ON_M
     may &= shared > 0.5 * np.minimum(own.length[i], before.length[j])
-    return i[may], normal[may], off[may]
+    turned = np.cos(before.direction[j] - own.direction[i]) < 0
+    is_faced = own.side[i] * before.side[j] * np.where(turned, -1, 1) > 0
+    return i[may], normal[may], off[may], is_faced[may]
 
 
 def _building(
     steps: Sequence[Step], estimate: Estimate, landmarks: LandmarkMap
-) -> list[tuple[str, Pieces]]:
+) -> tuple[Pieces, list[tuple[str, Pieces]]]:
     """The building as an earlier map has it, and as each visit saw it, by time."""
-    found: dict[str, list[tuple[Array, float, float]]] = defaultdict(list)
+    before: list[_Piece] = []
+    found: dict[str, list[_Piece]] = defaultdict(list)
     known = [e for e in landmarks.known.values() if e.kind != "point"]
     for wall, stays in zip(known, of_building(known).tolist(), strict=True):
         if stays:
-            found[_BEFORE] += _known_pieces(wall)
+            before += _known_pieces(wall)
     seen = walls_seen(steps, estimate, ("line", "segment"))
     stays = of_building([landmarks.entries[n] for n in seen])
     for (number, every), stay in zip(seen.items(), stays.tolist(), strict=True):
@@ -199,30 +213,28 @@ def _building(
                 found[visit].append(piece)
     first = {name: int(states.stamps_ns[0]) for name, states in estimate.states.items()}
     visits = sorted(first, key=lambda name: (first[name], name))
-    return [(name, _pieces(found[name])) for name in (_BEFORE, *visits)]
+    return _pieces(before), [(name, _pieces(found[name])) for name in visits]
 
 
-def _pieces(found: Sequence[tuple[Array, float, float]]) -> Pieces:
-    return Pieces(
-        np.array([at for at, _, _ in found]).reshape(-1, 2),
-        np.array([direction for _, direction, _ in found]),
-        np.array([length for _, _, length in found]),
-    )
+def _pieces(found: Sequence[_Piece]) -> Pieces:
+    at, *columns = zip(*found, strict=True) if found else ((), (), (), ())
+    return Pieces(np.array(at).reshape(-1, 2), *(np.array(column, float) for column in columns))
 
 
-def _known_pieces(wall: Entry) -> Iterator[tuple[Array, float, float]]:
-    """A wall of an earlier map in pieces: middle, direction, length."""
+def _known_pieces(wall: Entry) -> Iterator[_Piece]:
+    """A wall of an earlier map in pieces; it does not know from where they were seen."""
     first, last = wall.extent.tolist()
     ends = np.linspace(first, last, 1 + max(1, int(np.ceil((last - first) / PIECE_M))))
     for low, high in pairwise(ends.tolist()):
         middle = wall.mean[:2] + 0.5 * (low + high) * unit_vectors(wall.mean[2])
-        yield middle, float(wall.mean[2]), high - low
+        yield middle, float(wall.mean[2]), high - low, 0.0
 
 
 def _seen_pieces(
     seen: Sequence[Association], estimate: Estimate, mean: Array
-) -> Iterator[tuple[str, tuple[Array, float, float]]]:
-    """A wall in pieces as each visit saw it by itself: visit, and middle, direction, length."""
+) -> Iterator[tuple[str, _Piece]]:
+    """A wall in pieces as each visit saw it by itself: the visit, and the piece."""
+    viewers = between(mean, observed_from(seen, estimate.states))[:, 1]
     of_all = wall_observations(seen, estimate, mean)
     e, n = unit_vectors(mean[2]), unit_vectors(mean[2] + np.pi / 2)
     for visit in np.unique(of_all.robot).tolist():
@@ -233,7 +245,9 @@ def _seen_pieces(
             low, high = max(ends[0], k * PIECE_M), min(ends[1], (k + 1) * PIECE_M)
             if high - low < SHORTEST_M:
                 continue
-            (across, turn), _ = own.only(number == k).line()
+            piece = own.only(number == k)
+            (across, turn), _ = piece.line()
             middle = 0.5 * (low + high)
             at = mean[:2] + middle * e + (across + turn * middle) * n
-            yield visit, (at, float(mean[2] + turn), high - low)
+            side = float(np.sign(np.median(viewers[piece.index])))
+            yield visit, (at, float(mean[2] + turn), high - low, side)

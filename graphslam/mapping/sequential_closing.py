@@ -3,7 +3,8 @@
 Where a robot comes back, the drift since the last closure decides how far a submap has to be
 searched for. Closed in the order of the path, that is the drift of one loop, not of the whole log:
 windows stay small and most later submaps need no search at all. A few submaps are taken at a time;
-their closures must be consistent with each other and with what is closed already. The number of
+their closures must be consistent with each other and with what is closed already, and in the end
+each with all the others. The number of
 submaps that one is compared with is bounded, so the work grows with the path, not with its square,
 however often a place is visited.
 """
@@ -15,9 +16,12 @@ import numpy as np
 
 from graphslam.core.arrays import IntArray
 from graphslam.core.config import LoopClosureConfig
-from graphslam.core.geometry import Array, between
+from graphslam.core.consistency import distances_from_others
+from graphslam.core.gaussian import chi2_quantile
+from graphslam.core.geometry import Array, between, log, rotation3
 from graphslam.core.records import Closure
 from graphslam.mapping.loop_closure import (
+    AGREE,
     ALREADY_CLOSED,
     COV_INFLATION,
     MARGIN,
@@ -156,13 +160,36 @@ class _Closer:
             wrong |= np.abs(off[:, 2]) > MAX_RESIDUAL[1]
             if not wrong.any():
                 return
-            pairs = list(self.accepted)
-            for k in np.flatnonzero(wrong):
-                self.refused.add(pairs[k])
-                self.correcting.discard(pairs[k])
-                del self.accepted[pairs[k]]
+            self.take_back(np.flatnonzero(wrong))
         self.graph.poses = before
         self.graph.solve(None)
+
+    def judge_again(self) -> None:
+        """Take back closures that all the others contradict, the worst first.
+
+        While little is closed a place that only looks alike is consistent with what is known. Later
+        ones bend the path around it, so that its residual may be small; but without it they agree.
+        They are compared as closures are when they are proposed.
+        """
+        while self.accepted:
+            measured = self.relative_poses()
+            h, S = self.graph.relative(measured.end, measured.begin)
+            turn = rotation3(-measured.delta[:, 2])  # into the frames of the residuals
+            r = log(between(measured.delta, h))
+            R, S = (turn @ cov @ turn.mT for cov in (measured.cov, S))
+            d2 = distances_from_others(r, R, S, COV_INFLATION)
+            if d2.max() <= chi2_quantile(AGREE, 3):
+                return
+            self.take_back(np.array([d2.argmax()]))
+            self.solve()
+
+    def take_back(self, which: IntArray) -> None:
+        """Refuse some of the accepted closures (k,), by their order."""
+        pairs = list(self.accepted)
+        for k in which:
+            self.refused.add(pairs[k])
+            self.correcting.discard(pairs[k])
+            del self.accepted[pairs[k]]
 
     def ends(self, closure: Closure) -> tuple[int, int]:
         """Numbers of the earlier and the later submap."""
@@ -203,10 +230,13 @@ def close_loops(
         ends = [*range(AT_ONCE, len(order) + AT_ONCE, AT_ONCE), len(order)]
         for n, end in enumerate(ends):
             known = order[:end]
-            # in the end all of them once more: later loops moved the path, and a place that was
-            # out of reach may be in reach now
-            later = order if n == len(ends) - 1 else known[end - AT_ONCE :]
+            later = known[end - AT_ONCE :]
             graph.begin_with(nodes[known])
+            if n == len(ends) - 1:
+                # in the end all of them once more: later loops moved the path, and a place that was
+                # out of reach may be in reach now
+                later = order
+                closer.judge_again()
             for _ in range(MAX_ROUNDS):
                 found, confirming = verified_closures(
                     closer.candidates(later), closer.examined, verify
@@ -216,6 +246,7 @@ def close_loops(
                     found = [c for c in told if c not in confirming]
                 if not (found or confirming) or not closer.believe(found, confirming):
                     break
+    closer.judge_again()
     graph.begin_with(None)
     graph.solve(closer.relative_poses() if closer.accepted else None)
     correcting = [c for pair, c in closer.accepted.items() if pair in closer.correcting]

@@ -20,9 +20,9 @@ from graphslam.pipeline.keyframes import KeyframeSelector
 from graphslam.pipeline.log_pass import LogPass, PriorKnowledge, timed
 
 #: the scans of one robot are solved as a whole after so many steps, and again whenever there are so
-#: many times as many, so that all solutions together cost five times the last one. Of Intel without
-#: its first 0, 20, 40, 60 and 80 s, causal relations are off by 0.063 m in the mean, and by 0.094 m
-#: without batch steps; a factor of 2 is as bad (0.11 m, two logs), a start after 40 steps no better
+#: many times as many, so that all solutions together cost five times the last one. Without them
+#: Intel's causal relations had half as much error again (before `perception.breaks`). From 20 steps
+#: on, parts of 450 s gain (Intel 0.026 instead of 0.033 m), whole logs do not: docs/tried-live.md
 FIRST_BATCH_STEP, BATCH_STEP_GROWTH = 100, 1.25
 
 

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from graphslam.core.config import Config
+from graphslam.core.consistency import distances_from_others
 from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
-from graphslam.core.gaussian import chi2_quantile, symmetric
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, symmetric
 from graphslam.core.geometry import Array, between, compose, compose_cov, inverse, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Start
@@ -30,8 +31,6 @@ from graphslam.scan_smoothing.scan_tracking import ScanLog, TrackedLog
 
 #: chi-square of three degrees of freedom at 99.9 %
 START_GATE = float(chi2_quantile(0.999, 3))
-#: share of the least variance of a start by which the map has to make it smaller to contradict it
-LEAST_TOLD = 1e-3
 
 
 def localise(scan_log: ScanLog, known_map: KnownMap, tamper: Tamper | None = None) -> ClosedPaths:
@@ -87,7 +86,8 @@ def start_as_given(
     """
     given = given_start(scan_log, robot)
     laid = close_path_in_map(scan_log, robot, given, known_map, tamper)
-    is_wrong = is_contradicted(given, laid, robot)
+    first = laid.states[robot].poses[0]
+    is_wrong = is_contradicted(given, first, laid.start_covariance(robot), is_used=True)
     if is_wrong:  # pulled to what was told, the beginning of the path is torn
         laid = close_path_in_map(
             scan_log, robot, start_of_closed_path(laid, robot), known_map, tamper
@@ -103,18 +103,22 @@ def start_as_given(
     return (start_of_closed_path(laid, robot) if placed.confirmed.any() else given), laid
 
 
-def is_contradicted(given: Start, laid: ClosedPaths, robot: str) -> bool:
-    """Whether the map contradicts a start that was given by more than both are known to.
+def is_contradicted(given: Start, pose: Array, cov: Array, *, is_used: bool) -> bool:
+    """Whether a solution contradicts a start that was given by more than both are known to.
 
-    The path was ``laid`` with the start as a prior: how far it ends from that has the covariance of
-    the prior less that of the estimate.
+    Args:
+        given: the start.
+        pose: (3,) where the path begins in the solution.
+        cov: (3, 3) its covariance, along world axes, m and rad.
+        is_used: whether the start is a prior in the solution; it is compared with all else then.
     """
-    off = laid.states[robot].poses[0] - given.pose
+    off = pose - given.pose
     off[2] = wrap(off[2])
-    values, axes = np.linalg.eigh(symmetric(given.cov - laid.start_covariance(robot)))
-    # along axes in which the map tells nothing there is nothing left, and nothing off
-    told = values > LEAST_TOLD * np.diag(given.cov).min()
-    return bool(((axes.T @ off)[told] ** 2 / values[told]).sum() > START_GATE)
+    if is_used:
+        d2 = distances_from_others(off[None], given.cov[None], cov[None])[0]
+    else:
+        d2 = mahalanobis_squared(off, given.cov + cov)
+    return bool(d2 > START_GATE)
 
 
 def told_elsewhere(given: Start, pose: Array) -> str:

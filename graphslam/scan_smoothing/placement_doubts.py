@@ -7,13 +7,12 @@ that were undone. What contradicts both is no push: other things were moved as w
 was somewhere else.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphslam.core.gaussian import mahalanobis_squared
-from graphslam.core.geometry import Array, wrap
+from graphslam.core.geometry import Array
 from graphslam.core.records import Trajectory
 from graphslam.mapping.doubled_walls import LEAST_M
 from graphslam.mapping.known_map import latest_places
@@ -21,15 +20,13 @@ from graphslam.mapping.submaps import SubmapPose, submaps_at
 from graphslam.multi_robot.hypothesis_choice import doubt
 from graphslam.multi_robot.map_localisation import support
 from graphslam.scan_smoothing.localisation import (
-    START_GATE,
     given_start,
+    is_contradicted,
     is_start_given,
     told_elsewhere,
 )
+from graphslam.scan_smoothing.path_closing import PLACE_COV
 from graphslam.scan_smoothing.scan_tracking import TrackedLog
-
-#: in place of a visit's name, of a known map
-_BEFORE = ""
 
 
 def doubt_again(
@@ -61,33 +58,41 @@ def _doubts(
     anchors = {name: np.array(scan_log.paths[name].anchors) for name in states}
     submaps, _ = submaps_at(anchors, states, scan_log.keyframe_scans, scan_log.config)
     known_map = scan_log.known.known_map
-    before: dict[str, list[SubmapPose]] = {}
-    if known_map is not None:
-        before[_BEFORE] = [*known_map.places]
+    stays = np.zeros(2)
+    before = [] if known_map is None else [_Placed(known_map.places, stays)]
     found = {}
     for name in sorted(states, key=lambda name: (int(states[name].stamps_ns[0]), name)):
         own = [submap for submap in submaps if submap.state[0] == name]
-        seen = latest_places([place for visit in reversed(before) for place in before[visit]])
-        placed = support(seen, own, _pushed(name, before, by))
+        visit = _Placed(own, by.get(name, stays))
+        seen = latest_places([place for one in reversed(before) for place in one.places])
+        placed = support(seen, own, visit.pushed_since(before))
         if placed.confirmed.any():
             found[name] = doubt(placed, own, scan_log.config.loop_closure)
-        before[name] = own
+        before.append(visit)
     return found
 
 
-def _pushed(name: str, before: Iterable[str], by: Mapping[str, Array]) -> list[Array]:
-    """By how much a visit was displaced against each of those before it, where that is not 0."""
-    stays = np.zeros(2)
-    off = [by.get(name, stays) - by.get(visit, stays) for visit in before]
-    return [motion for motion in off if np.hypot(*motion) > LEAST_M]
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """Places of a visit, or of a known map, and ``by`` how much it was displaced (2,), m."""
+
+    places: Sequence[SubmapPose]
+    by: Array
+
+    def pushed_since(self, before: Iterable["_Placed"]) -> list[Array]:
+        """By how much it was displaced against each of those before it, where that is not 0."""
+        off = [self.by - one.by for one in before]
+        return [motion for motion in off if np.hypot(*motion) > LEAST_M]
 
 
 def _told_elsewhere(scan_log: TrackedLog, name: str, pose: Array) -> str:
-    """That a start was told which the solution (3,) contradicts; empty if it does not."""
+    """That a start was told which the solution (3,) contradicts; empty if it does not.
+
+    It is no part of the solution: the path begins where the map has it (`start_as_given`). How well
+    the map as a whole lies in the world does not matter, so the path is known as places in it are.
+    """
     if not is_start_given(scan_log.config, name):
         return ""
     given = given_start(scan_log, name)
-    off = pose - given.pose
-    off[2] = wrap(off[2])
-    is_wrong = mahalanobis_squared(off, given.cov) > START_GATE
+    is_wrong = is_contradicted(given, pose, PLACE_COV, is_used=False)
     return told_elsewhere(given, pose) if is_wrong else ""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from graphslam.core.consistency import (
+    distances_from_others,
     fit_rigid_transform,
     generalised_least_squares,
     greedy_max_clique,
@@ -88,6 +89,37 @@ def test_leave_one_out_distances_are_those_of_the_conditional_gaussian():
         innovation = r[k] - gain @ r.ravel()[rest]
         cov = S[np.ix_(own, own)] - gain @ S[np.ix_(rest, own)]
         np.testing.assert_allclose(found[k], innovation @ np.linalg.solve(cov, innovation))
+
+
+def test_distances_from_others_are_those_of_the_solution_without_each():
+    """Of a least-squares solution of measurements of unequal leverage; against solving it again
+    without each of them, which is exact to rounding. Residuals alone hide what has leverage."""
+    rng = np.random.default_rng(3)
+    n, d, inflation = 6, 3, 16.0
+    H = rng.normal(size=(n, d, 4))
+    H[0, :, 3] += 30.0  # the others hardly tell the last unknown
+    root = rng.normal(size=(n, d, d)) + 2.0 * np.eye(d)
+    R = 0.01 * root @ root.mT
+    z = rng.normal(size=(n, d))
+    prior = 1e-2 * np.eye(4)
+
+    def solved(which):
+        N = prior + sum(H[k].T @ np.linalg.solve(R[k], H[k]) for k in which)
+        y = sum(H[k].T @ np.linalg.solve(R[k], z[k]) for k in which)
+        return np.linalg.solve(N, y), np.linalg.inv(N)
+
+    x, P = solved(range(n))
+    found = distances_from_others(H @ x - z, R, H @ P @ H.mT, inflation)
+    for k in range(n):
+        x, P = solved([m for m in range(n) if m != k])
+        off, S = H[k] @ x - z[k], inflation * H[k] @ P @ H[k].T + R[k]
+        assert found[k] == pytest.approx(off @ np.linalg.solve(S, off), rel=1e-9)
+
+
+def test_where_others_say_nothing_nothing_contradicts_a_measurement():
+    """A start alone: the solution lies on it, to rounding, and is as well known as it says."""
+    R = np.diag([4.0, 1e-4, 1e-6])[None]
+    assert distances_from_others(np.full((1, 3), 1e-9), R, R * (1 + 1e-12))[0] == 0.0
 
 
 @pytest.mark.parametrize("of", ["innovation", "covariance"])

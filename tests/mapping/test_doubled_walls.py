@@ -82,10 +82,10 @@ def test_an_earlier_map_is_a_visit_and_one_visit_alone_is_none():
     assert found.is_clear and found.by == pytest.approx((-0.2, -0.1), abs=0.01)
 
 
-def pieces(*walls):
-    """Of middles x, y, directions and lengths."""
+def pieces(*walls, side=0):
+    """Of middles x, y, directions and lengths, all seen from one side."""
     table = np.array(walls, float).reshape(-1, 4)
-    return Pieces(table[:, :2], table[:, 2], table[:, 3])
+    return Pieces(table[:, :2], table[:, 2], table[:, 3], np.full(len(table), side))
 
 
 HALF = np.pi / 2
@@ -96,6 +96,37 @@ def test_one_wall_seen_from_both_sides_is_no_displacement():
     found = compare(pieces((2, 0.1, 0, 4), (6, 0.1, 0, 4)), pieces((2, 0, 0, 4), (6, 0, 0, 4)))
     assert found.twice_m == 8.0
     assert not found.is_clear and not found.is_doubtful
+
+
+@pytest.mark.parametrize(
+    ("turned", "side", "doubt"),
+    [(0, 1, True), (np.pi, -1, True), (0, -1, False), (np.pi, 1, False), (0, 0, False)],
+)
+def test_one_wall_seen_twice_from_one_side_is_a_doubt(turned, side, doubt):
+    """Pushed across the one wall in sight that could tell, by 10 cm: the second day was 0.1 m off
+    with a good verdict (the lab, seeds 1 and 6). It may as well be a long row of cupboards, so the
+    day is not displaced. From both sides, or from one that is not known, it may be a partition."""
+    before = pieces((2, 0.1, 0, 3), (5, 0.1, 0, 3), side=1)
+    own = pieces((2, 0, turned, 3), (5, 0, turned, 3), side=side)
+    found = compare(own, before)
+    assert found.is_doubtful is doubt
+    assert not found.is_clear
+
+
+def test_one_row_that_was_moved_in_front_of_walls_that_stay_is_no_doubt():
+    """Of a room's walls across the direction in which it was moved, one is in sight: 3 m of it."""
+    row, wall = (2, 0.1, 0, 4), (2, 6, 0, 3)
+    found = compare(pieces((2, 0, 0, 4), wall, side=1), pieces(row, wall, side=1))
+    assert found.faced_m == 4.0 and found.once_m == 3.0
+    assert not found.is_doubtful
+
+
+def test_a_wall_is_known_to_be_seen_from_inside_the_room():
+    """By where the robot was, whichever way the wall's landmark points."""
+    for walls in (WALLS[:1], [((5, 0, np.pi), 4.0)]):
+        (found,) = displacements(*room((0.0, 0.1), walls=walls)).values()
+        assert found.faced_m == pytest.approx(found.twice_m) and found.twice_m > 3.0
+        assert found.is_doubtful and not found.is_clear
 
 
 @pytest.mark.parametrize(("staying", "doubt"), [(0, True), (1, True), (10, False)])

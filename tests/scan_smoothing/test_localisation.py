@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from graphslam.core.frame_forest import PRIOR_INFLATION
-from graphslam.core.records import Trajectory
+from graphslam.core.records import Start, Trajectory
 from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
-from graphslam.scan_smoothing.localisation import start_of_closed_path
+from graphslam.scan_smoothing.localisation import is_contradicted, start_of_closed_path
 
 LAID = np.array([20.0, 6.0, 0.1])
 
@@ -37,3 +37,27 @@ def test_it_is_as_wide_as_its_scans_may_enter_again():
     found = start_of_closed_path(laid_with(sigmas), "robot")
     # what was told apart takes off a fiftieth at most
     np.testing.assert_allclose(np.sqrt(np.diag(found.cov)), PRIOR_INFLATION * sigmas, rtol=0.02)
+
+
+@pytest.mark.parametrize(("off_m", "is_wrong"), [(0.15, False), (0.5, True)])
+@pytest.mark.parametrize("is_used", [True, False])
+def test_a_told_start_is_contradicted_alike_whether_the_solution_has_it_or_not(
+    off_m, is_wrong, is_used
+):
+    """0.1 m was told, and all else knows 0.05 m: chi-square of 16.27 at 99.9 % is reached 0.45 m
+    off. A solution that has the start lies a fifth of the way to it, and is known better: taken for
+    one that has not, half a metre would pass."""
+    given = Start(LAID, np.diag([0.1, 0.1, 0.01]) ** 2)
+    pose, cov = LAID + np.array([off_m, 0.0, 2 * np.pi]), np.diag([0.05, 0.05, 0.005]) ** 2
+    if is_used:
+        gain = cov @ np.linalg.inv(cov + given.cov)
+        pose = pose + gain @ np.array([-off_m, 0.0, 0.0])
+        cov = cov - gain @ cov
+    assert is_contradicted(given, pose, cov, is_used=is_used) == is_wrong
+
+
+def test_a_solution_that_knows_no_more_than_the_told_start_does_not_contradict_it():
+    """Along a corridor the path begins where it is told to, but for rounding."""
+    given = Start(LAID, np.diag([0.1, 0.1, 0.01]) ** 2)
+    cov = given.cov * np.array([1 - 1e-9, 0.1, 0.1])
+    assert not is_contradicted(given, LAID + np.array([1e-6, 0.0, 0.0]), cov, is_used=True)

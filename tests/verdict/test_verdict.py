@@ -477,7 +477,7 @@ def test_counts_of_the_run_are_judged(change, level, text):
 )
 def test_walls_of_the_building_that_stand_twice_are_said(once_m, level):
     """All furniture was pushed by 25 cm: the second day lay off by that, with a good verdict."""
-    found = {"day1": Displacement(np.array([0.2, 0.15]), 13.0, once_m, 8.0)}
+    found = {"day1": Displacement(np.array([0.2, 0.15]), 13.0, once_m, 8.0, 13.0)}
     verdict, told = reasons(replace(evidence(), displacements=found))
     assert verdict == level
     said = "day1: walls of the building appear twice over 13 m, displaced alike by 0.25 m"
