@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray
 from graphslam.core.config import OdometryConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, solve
 from graphslam.core.geometry import Array, compose, wrap
@@ -81,7 +82,7 @@ class NoiseEvidence:
         return cls(miss**2 - explained, _diagonal(K @ white @ K.mT), _diagonal(white), 1)
 
     def with_motions(
-        self, found: "NoiseEvidence", used: Array, past: float = 1.0
+        self, found: "NoiseEvidence", used: BoolArray, past: float = 1.0
     ) -> "NoiseEvidence":
         """The same with those motions that are ``used`` (n,); the ``past`` may weigh less."""
         return NoiseEvidence(
@@ -127,8 +128,13 @@ def _floor(config: OdometryConfig) -> Array:
 class Calibrator:
     """Recursive least squares over one robot's motions."""
 
-    def __init__(self, config: OdometryConfig) -> None:
+    def __init__(self, config: OdometryConfig, *, is_noise_known: bool = False) -> None:
+        """Nothing learnt yet.
+
+        ``is_noise_known``: odometry is as noisy as motions say; derivatives are as measured.
+        """
         self._floor, self._noise = _floor(config), NoiseEvidence.none()
+        self._is_noise_known = is_noise_known
         self._prior: Array | None = None
         self._info: Array = np.zeros((0, 0))
         self._prior_info: Array = np.zeros((0, 0))
@@ -162,23 +168,15 @@ class Calibrator:
             self._names = current.names
         miss = moved - motion.delta
         miss[2] = wrap(miss[2])
-        by_calibration = D @ current.cov @ D.T
-        white, floor = motion.cov - by_calibration, self._floor
-        after = solve(np.eye(3) + motion.cov @ observed, motion.cov)
-        each = (one[None] for one in (miss, white, by_calibration, observed, after))
-        found = NoiseEvidence.of(*each)
-        odometry = self._noise.applied(white) + by_calibration
-        if miss @ solve(odometry + floor, miss) > OUTLIER_D2 or not observed.any():
+        white = motion.cov - D @ current.cov @ D.T
+        total = self._noise.applied(white) + D @ self._prior @ D.T + self._floor
+        if miss @ solve(total, miss) > OUTLIER_D2 or not observed.any():
             return current
-        self._noise = self._noise.with_motions(found, np.ones(1, dtype=bool), FORGETTING_FACTOR)
-        noise = self._noise.applied(white)
-        # the likeliest motion, as neither odometry nor the estimate is without error
-        estimated = motion.delta + (noise + by_calibration) @ solve(
-            noise + by_calibration + floor, miss
-        )
-        D = at_estimated_motion(source, motion.delta[None], D[None], estimated[None])[0]
+        if not self._is_noise_known:
+            D = self._learn_noise(source, motion, miss, white, observed)
         # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
-        W = solve(np.eye(3) + observed @ (noise + floor), observed)
+        noise = self._noise.applied(white) + self._floor
+        W = solve(np.eye(3) + observed @ noise, observed)
         weighted = D.T @ W
         # relative to nominal values: the remaining error plus the present correction
         past = FORGETTING_FACTOR
@@ -188,6 +186,21 @@ class Calibrator:
         return Calibration(
             current.names, cov @ self._vector, cov + MIN_SIGMA_SHARE**2 * self._prior
         )
+
+    def _learn_noise(
+        self, source: CalibratedSource, motion: Motion, miss: Array, white: Array, observed: Array
+    ) -> Array:
+        """Measure the noise of odometry; derivative (3, p) at the likeliest motion by it."""
+        after = solve(np.eye(3) + motion.cov @ observed, motion.cov)
+        shared = motion.cov - white
+        each = (one[None] for one in (miss, white, shared, observed, after))
+        found = NoiseEvidence.of(*each)
+        self._noise = self._noise.with_motions(found, np.ones(1, dtype=bool), FORGETTING_FACTOR)
+        # neither odometry nor the estimate is without error
+        cov = self._noise.applied(white) + shared
+        likeliest = motion.delta + cov @ solve(cov + self._floor, miss)
+        delta, d_cal = motion.delta[None], motion.d_delta_d_calibration[None]
+        return np.asarray(at_estimated_motion(source, delta, d_cal, likeliest[None])[0])
 
     def restart(self, prior: Calibration, found: Calibration) -> Calibration:
         """Go on from a calibration that was estimated together with all states so far.

@@ -13,7 +13,6 @@ import numpy as np
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, compose, compose_cov, wrap
-from graphslam.core.motion_models import Calibration
 from graphslam.core.records import KeyframeScan, Motion, Step
 from graphslam.logs import LogSet
 from graphslam.mapping.local_tracking import LocalTracker
@@ -119,11 +118,11 @@ class ScanLog(TrackedLog):
         ``ahead``: the keyframes, if they are read already.
         """
         known: CalibrationEvidence | None = None
-        calibration: Calibration | None = None
+        learnt: Learnt | None = None
         with ahead or read_ahead(self.log, self.given_config) as reading:
             while (item := reading.receive()) is not None:
                 if isinstance(item, ReadLog):
-                    self._finish(item, calibration)
+                    self._finish(item, learnt)
                 if not isinstance(item, KeyframeBlock):
                     continue
                 progress(item.messages)
@@ -133,8 +132,9 @@ class ScanLog(TrackedLog):
                     with timed(self.seconds, "calibration"):
                         known = self._evidence(item, moved, known)
                         calibration = calibration_from_evidence(known, item.prior)
+                        learnt = Learnt(calibration, known.noise.scale)
                 # the next block is being read; this is for the one after it
-                reading.send(known and Learnt(calibration, known.noise.scale))
+                reading.send(learnt)
                 if moved:
                     took = item.seconds + time.perf_counter() - began
                     self.step_ms += [1e3 * took / len(moved)] * len(moved)
@@ -211,7 +211,7 @@ class ScanLog(TrackedLog):
         )
         return known.with_motions(found, self.runs[self._robot].track.config)
 
-    def _finish(self, read: ReadLog, calibration: Calibration | None) -> None:
+    def _finish(self, read: ReadLog, learnt: Learnt | None) -> None:
         """The end of the log: the last landmarks, and an anchor at the last state."""
         tracker, path, run = self._tracker, self._path, read.run
         self.wrong_lasers = read.wrong_lasers
@@ -227,7 +227,7 @@ class ScanLog(TrackedLog):
         if tracker is None:
             return
         run.times = path.times
-        run.track.calibration = calibration or run.track.prior
+        run.track.calibration = learnt.calibration if learnt else run.track.prior
         if path.anchors[-1] != len(path.times) - 1:
             path.anchors.append(len(path.times) - 1)
         if self.config.odometry.calibrate:
