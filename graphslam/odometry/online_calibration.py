@@ -24,7 +24,6 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Motion
 from graphslam.odometry.calibration_jacobian import CalibratedSource, at_estimated_motion
-from graphslam.odometry.increment_sums import Motions
 
 #: weight of the past per state: the memory is about 1 / (1 - FORGETTING_FACTOR) states, so that
 #: parameters may change slowly (tyres warm up)
@@ -105,13 +104,11 @@ class NoiseEvidence:
         return np.asarray(sigmas[:, None] * white * sigmas)
 
 
-def noisier(motions: Motions, calibration: Calibration, scale: Array) -> Motions:
-    """Motions whose noise has variances that are a factor (3,) larger, as far as it is white."""
-    if np.all(scale == 1.0):
-        return motions
-    sigmas, shared = np.sqrt(scale), motions.d_cal @ calibration.cov @ motions.d_cal.mT
-    cov = sigmas[:, None] * (motions.cov - shared) * sigmas + shared
-    return replace(motions, cov=cov)
+def noisier(motion: Motion, calibration_cov: Array, scale: Array) -> Motion:
+    """A motion whose noise has variances that are a factor (3,) larger, as far as it is white."""
+    D, sigmas = motion.d_delta_d_calibration, np.sqrt(scale)
+    shared = D @ calibration_cov @ D.T
+    return replace(motion, cov=sigmas[:, None] * (motion.cov - shared) * sigmas + shared)
 
 
 def _diagonal(matrices: Array) -> Array:

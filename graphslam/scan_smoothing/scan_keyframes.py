@@ -322,7 +322,7 @@ class _Reader:
         self._keep_between([scan for scan in self._held if scan.time_ns <= last_ns])
         keyframes = [
             ScanKeyframe(i.scan.time_ns, i.scan.mount, motion, i.seen, i.points)
-            for i, motion in zip(images, motions, strict=True)
+            for i, motion in zip(images, self._as_noisy(motions), strict=True)
         ]
         every = self._config.odometry.scan_matching != "auto"
         pairs = [pair for pair in compared.pairs if pair.suspect or every]
@@ -360,11 +360,17 @@ class _Reader:
         ends = np.array([self._state_ns, *(s.time_ns for s in used)], dtype=np.int64)
         with timed(self._seconds, "motions"):
             many = self.run.track.motions(ends[:-1], ends[1:])
-            many = noisier(many, self.run.track.calibration, self._noise_scale)
         return [
             many.one(k, int(ends[k]), int(ends[k + 1])) if ends[k + 1] > ends[k] else None
             for k in range(len(used))
         ]
+
+    def _as_noisy(self, motions: Sequence[Motion | None]) -> list[Motion | None]:
+        """Motions as noisy as they were found to be; scans check them by what is stated."""
+        shared, scale = self.run.track.calibration.cov, self._noise_scale
+        if np.all(scale == 1.0):
+            return list(motions)
+        return [motion and noisier(motion, shared, scale) for motion in motions]
 
     def _sweeps(
         self, used: list[Scan], laser: "_Laser", keep_moving: bool
