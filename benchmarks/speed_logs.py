@@ -82,19 +82,19 @@ def building(path_m: float = 2000.0, period_s: float = 0.205, seed: int = 1) -> 
     assert vehicle.laser is not None
     vehicle = replace(
         vehicle,
-        start_m=_crossing((0, 0)),
-        drive=(Leg(through_m=tuple(_tour(path_m, rng))),),
+        start_m=crossing((0, 0)),
+        drive=(Leg(through_m=tuple(tour(path_m, rng))),),
         laser=replace(vehicle.laser, period_s=period_s),
     )
     return Scenario({"vehicle": vehicle}, _floor(rng), name="building")
 
 
-def _crossing(at: tuple[int, int]) -> Point:
+def crossing(at: tuple[int, int]) -> Point:
     """Where corridors cross, by column and row, m."""
     return at[0] * PITCH_M[0], at[1] * PITCH_M[1]
 
 
-def _tour(path_m: float, rng: np.random.Generator) -> Iterator[Point]:
+def tour(path_m: float, rng: np.random.Generator) -> Iterator[Point]:
     """Crossings at which the drive turns, and its last one."""
     driven: Counter[frozenset[tuple[int, int]]] = Counter()
     before, here, length = (-1, 0), (0, 0), 0.0
@@ -109,21 +109,21 @@ def _tour(path_m: float, rng: np.random.Generator) -> Iterator[Point]:
         ways = [way for way in ways if driven[frozenset((here, way))] == fewest]
         after = ways[rng.integers(len(ways))]
         if (before[0] == x) != (x == after[0]):
-            yield _crossing(here)
+            yield crossing(here)
         driven[frozenset((here, after))] += 1
-        length += math.dist(_crossing(here), _crossing(after))
+        length += math.dist(crossing(here), crossing(after))
         before, here = here, after
-    yield _crossing(here)
+    yield crossing(here)
 
 
 def _floor(rng: np.random.Generator) -> StaticObjects:
     """Blocks of rooms, rooms around all corridors, and the facade."""
     half = CORRIDOR_M / 2
-    (right, top), outer = _crossing(BLOCKS), half + OUTER_M
+    (right, top), outer = crossing(BLOCKS), half + OUTER_M
     facade = _rectangle(-outer, -outer, right + outer, top + outer)
     things: list[Thing] = [Wall("facade", facade, closed=True)]
     for column, row in np.ndindex(*BLOCKS):
-        (x0, y0), (x1, y1) = _crossing((column, row)), _crossing((column + 1, row + 1))
+        (x0, y0), (x1, y1) = crossing((column, row)), crossing((column + 1, row + 1))
         name, y = f"block {column}.{row}", (y0 + y1) / 2
         corners = _rectangle(x0 + half, y0 + half, x1 - half, y1 - half)
         things += _rooms(name, corners, y - y0 - half, rng)

@@ -56,6 +56,7 @@ SMALL: dict[str, list[str]] = {
     "wide_information.py": ["--poses", "60", "--seeds", "1"],
     "without_odometry.py": ["lab", "--seeds", "1"],
     "workers.py": ["--only", "throughput", "--logs", "2"],
+    "slipping_wheels.py": ["rounds", "--seeds", "1", "--slip", "0.02"],
     "wrong_odometry.py": ["--seeds", "1"],
     "yardstick.py": [],
 }

@@ -20,6 +20,7 @@ from graphslam.odometry.online_calibration import (
     Calibrator,
     TrackedMotions,
     calibration_from_evidence,
+    noisier,
     observed_information,
 )
 from graphslam.odometry.preintegration import Track
@@ -562,3 +563,14 @@ def test_a_drive_by_noise_that_was_learnt_measures_the_same_noise():
         made = replace(made, moved=moved, moved_cov=P)
         found.append(CalibrationEvidence.none(3).with_motions(made, OdometryConfig()).noise.scale)
     np.testing.assert_allclose(found[0], found[1], rtol=0.1)
+
+
+def test_learnt_noise_is_that_of_the_odometry_and_not_of_its_calibration():
+    """A factor on the white part along each axis; what the calibration leaves open stays."""
+    drive = Drive(weaving(100, np.random.default_rng(1)))
+    motion, calibration = drive.track.motion(SECOND, 3 * SECOND), drive.track.calibration
+    D = motion.d_delta_d_calibration
+    shared = D @ calibration.cov @ D.T
+    made = noisier(motion, calibration.cov, np.array([1.0, 4.0, 9.0]))
+    before, after = (np.diag(one.cov - shared) for one in (motion, made))
+    np.testing.assert_allclose(after, before * [1.0, 4.0, 9.0], rtol=1e-6)

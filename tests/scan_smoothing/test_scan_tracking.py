@@ -12,7 +12,9 @@ from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, compose_cov, exp
 from graphslam.core.records import OdometryPose
 from graphslam.logs import open_logs
+from graphslam.odometry.online_calibration import Learnt
 from graphslam.odometry.preintegration import Track
+from graphslam.scan_smoothing.scan_keyframes import KeyframeBlock, read_keyframes
 from graphslam.scan_smoothing.scan_tracking import TrackedPath, recalibrate_path
 from graphslam.slam.smooth import smooth
 
@@ -114,3 +116,30 @@ def test_loose_returns_are_in_the_last_solution():
     seen = [a for step in result.steps for a in step.associations]
     assert result.summary["consolidated"]["observations_by_loose_returns"] > len(states) / 2
     assert {a.target for a in seen} == {landmark.id for landmark in result.landmarks}
+
+
+def white_noise_of_motions(noise_scale, *settings):
+    """Variances (n, 3) of the motions of the sample log, without what the calibration leaves open,
+    where the reader is told this factor after the first block."""
+    config = load_config(overrides=settings)
+    reading = read_keyframes(open_logs([ROOT / "logs" / "lab.mcap"], config), config, 1 << 30)
+    item, found = next(reading), []
+    while isinstance(item, KeyframeBlock):
+        for motion in (k.motion for k in item.keyframes if k.motion is not None):
+            D = motion.d_delta_d_calibration
+            found.append(np.diag(motion.cov - D @ item.source.calibration.cov @ D.T))
+        item = reading.send(Learnt(item.source.calibration, noise_scale))
+    return np.array(found)
+
+
+def test_learnt_noise_is_in_later_motions_unless_noise_is_stated():
+    """Tracking would follow odometry that is noisier than the default too far. What somebody states
+    is used as stated."""
+    factor = np.array([1.0, 4.0, 9.0])
+    ratio = white_noise_of_motions(factor) / white_noise_of_motions(np.ones(3))
+    np.testing.assert_array_equal(ratio[0], np.ones(3))  # of the first block
+    np.testing.assert_allclose(ratio[-1], factor, rtol=1e-6)
+    stated = "odometry.k_phi_m=2e-4"
+    np.testing.assert_array_equal(
+        white_noise_of_motions(factor, stated), white_noise_of_motions(np.ones(3), stated)
+    )
