@@ -67,6 +67,7 @@ class LogPass:
             name: RobotState(
                 track,
                 clock=known.clocks.get(name, Clock()),
+                has_scans=log.has_scans(name),
                 since_keyframe=ScansSinceKeyframe.of_smoother(config, track),
             )
             for name, track in make_tracks(log, config).items()

@@ -47,7 +47,8 @@ class RobotState:
     calibration known then. ``latest_pose`` (3,) is the present estimate of the latest one: after a
     batch step by more than when it was made. ``scans``: (stamp, time, mount) of each; ``between``:
     beams of those without a state, where they are kept, ``kept_ns`` the time of the last of these
-    or of a scan with a state;
+    or of a scan with a state; ``has_scans``: whether its log has any: odometry beside sightings is
+    calibrated by the noise that is stated or measured elsewhere;
     ``since_keyframe``: where they were when they came, if that is asked for;
     ``scanned_ns``: time of the last one used. States are poses of the sensor; the base is where the
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
@@ -76,11 +77,12 @@ class RobotState:
     repeats: RepeatedScans = field(default_factory=RepeatedScans)
     between: ScansBetween = field(default_factory=ScansBetween)
     kept_ns: int | None = None
+    has_scans: bool = True
     since_keyframe: ScansSinceKeyframe | None = None
 
     def __post_init__(self) -> None:
         """Calibrate the track's odometry by its own settings."""
-        self.calibrator = Calibrator(self.track.config)
+        self.calibrator = Calibrator(self.track.config, is_noise_known=not self.has_scans)
 
     @property
     def started(self) -> bool:

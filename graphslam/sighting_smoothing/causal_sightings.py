@@ -27,7 +27,7 @@ from graphslam.mapping.robot_candidates import (
     robots_in,
 )
 from graphslam.odometry.calibration_jacobian import CalibratedSource
-from graphslam.odometry.online_calibration import Calibrator, observed_information
+from graphslam.odometry.online_calibration import observed_information
 from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.robot_state import Causal, RobotState
 from graphslam.sighting_smoothing.causal_noise import NoiseSoFar
@@ -70,9 +70,10 @@ def replay_causally(one: SightingPass) -> CausalReplay:
 
 def _replay(one: SightingPass, tracks: Mapping[str, Track]) -> CausalReplay:
     backend = CompressedBackend(_config(one))
-    runs = {name: RobotState(track, clock=one.runs[name].clock) for name, track in tracks.items()}
-    for run in runs.values():  # it is measured below, with that of the sightings
-        run.calibrator = Calibrator(run.track.config, is_noise_known=True)
+    runs = {
+        name: RobotState(track, clock=one.runs[name].clock, has_scans=False)
+        for name, track in tracks.items()
+    }
     known: set[int | str] = set()
     step_ms: list[float] = []
     latest: dict[str, Array] = {}  # estimates of the latest states
