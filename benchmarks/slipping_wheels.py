@@ -34,16 +34,12 @@ FOUND = ("rotation_scale", "drift_rad_per_m", "laser_latency_s")
 
 def floor(seed: int) -> Scenario:
     """The large floor: a round along its outermost corridors, then a drive along all of them."""
-    before, speed_logs.PITCH_M = speed_logs.PITCH_M, PITCH_M
-    try:
-        made = speed_logs.building(TOUR_M, seed=seed)
-        ring = [speed_logs.crossing(at) for at in ((4, 0), (4, 3), (0, 3), (0, 0))]
-        rng = np.random.default_rng(seed)
-        tour: Sequence[Point] = ((0.0, 0.0),)
-        while tour[0][0] == 0.0:  # where the round ends it does not turn back
-            tour = tuple(speed_logs.tour(TOUR_M, rng))
-    finally:
-        speed_logs.PITCH_M = before
+    made = speed_logs.building(TOUR_M, seed=seed, pitch_m=PITCH_M)
+    ring = [speed_logs.crossing(at, PITCH_M) for at in ((4, 0), (4, 3), (0, 3), (0, 0))]
+    rng = np.random.default_rng(seed)
+    tour: Sequence[Point] = ((0.0, 0.0),)
+    while tour[0][0] == 0.0:  # where the round ends it does not turn back
+        tour = tuple(speed_logs.tour(TOUR_M, rng, PITCH_M))
     vehicle = replace(made.robots["vehicle"], drive=(Leg(through_m=(*ring, *tour)),), speed_m_s=0.8)
     return replace(made, robots={"vehicle": vehicle})
 
@@ -107,10 +103,12 @@ def rows(kinds: Sequence[str], slips: Sequence[float], seeds: int, folder: Path)
 def main() -> None:
     """Print the table."""
     options = parser(__doc__)
-    options.add_argument("logs", nargs="*", choices=[*LOGS, []], default=list(LOGS))
+    options.add_argument("logs", nargs="*", default=list(LOGS))
     options.add_argument("--seeds", type=int, default=3)
     options.add_argument("--slip", type=float, nargs="+", default=list(ERRORS))
     given = options.parse_args()
+    if unknown := set(given.logs) - LOGS.keys():
+        options.error(f"no such log: {', '.join(sorted(unknown))}")
     print(
         f"{'log':8}{'slip':>6}{'seed':>5}{'error':>8}{'aligned':>9}{'NEES':>7}  {'verdict':9}"
         + "".join(f"{name:>25}" for name in FOUND)

@@ -71,7 +71,9 @@ OPEN_SHARE, DESK_SHARE, CABINET_SHARE = 0.3, 0.7, 0.2
 Thing = Wall | Box | Door
 
 
-def building(path_m: float = 2000.0, period_s: float = 0.205, seed: int = 1) -> Scenario:
+def building(
+    path_m: float = 2000.0, period_s: float = 0.205, seed: int = 1, pitch_m: Point = PITCH_M
+) -> Scenario:
     """A floor of 12 blocks of rooms with 20 crossings, 530 m of corridors, and a drive along them.
 
     At each crossing the vehicle goes where it has been least, so that rings are closed early and
@@ -82,19 +84,19 @@ def building(path_m: float = 2000.0, period_s: float = 0.205, seed: int = 1) -> 
     assert vehicle.laser is not None
     vehicle = replace(
         vehicle,
-        start_m=crossing((0, 0)),
-        drive=(Leg(through_m=tuple(tour(path_m, rng))),),
+        start_m=crossing((0, 0), pitch_m),
+        drive=(Leg(through_m=tuple(tour(path_m, rng, pitch_m))),),
         laser=replace(vehicle.laser, period_s=period_s),
     )
-    return Scenario({"vehicle": vehicle}, _floor(rng), name="building")
+    return Scenario({"vehicle": vehicle}, _floor(rng, pitch_m), name="building")
 
 
-def crossing(at: tuple[int, int]) -> Point:
+def crossing(at: tuple[int, int], pitch_m: Point) -> Point:
     """Where corridors cross, by column and row, m."""
-    return at[0] * PITCH_M[0], at[1] * PITCH_M[1]
+    return at[0] * pitch_m[0], at[1] * pitch_m[1]
 
 
-def tour(path_m: float, rng: np.random.Generator) -> Iterator[Point]:
+def tour(path_m: float, rng: np.random.Generator, pitch_m: Point) -> Iterator[Point]:
     """Crossings at which the drive turns, and its last one."""
     driven: Counter[frozenset[tuple[int, int]]] = Counter()
     before, here, length = (-1, 0), (0, 0), 0.0
@@ -109,21 +111,22 @@ def tour(path_m: float, rng: np.random.Generator) -> Iterator[Point]:
         ways = [way for way in ways if driven[frozenset((here, way))] == fewest]
         after = ways[rng.integers(len(ways))]
         if (before[0] == x) != (x == after[0]):
-            yield crossing(here)
+            yield crossing(here, pitch_m)
         driven[frozenset((here, after))] += 1
-        length += math.dist(crossing(here), crossing(after))
+        length += math.dist(crossing(here, pitch_m), crossing(after, pitch_m))
         before, here = here, after
-    yield crossing(here)
+    yield crossing(here, pitch_m)
 
 
-def _floor(rng: np.random.Generator) -> StaticObjects:
+def _floor(rng: np.random.Generator, pitch_m: Point) -> StaticObjects:
     """Blocks of rooms, rooms around all corridors, and the facade."""
     half = CORRIDOR_M / 2
-    (right, top), outer = crossing(BLOCKS), half + OUTER_M
+    (right, top), outer = crossing(BLOCKS, pitch_m), half + OUTER_M
     facade = _rectangle(-outer, -outer, right + outer, top + outer)
     things: list[Thing] = [Wall("facade", facade, closed=True)]
     for column, row in np.ndindex(*BLOCKS):
-        (x0, y0), (x1, y1) = crossing((column, row)), crossing((column + 1, row + 1))
+        x0, y0 = crossing((column, row), pitch_m)
+        x1, y1 = crossing((column + 1, row + 1), pitch_m)
         name, y = f"block {column}.{row}", (y0 + y1) / 2
         corners = _rectangle(x0 + half, y0 + half, x1 - half, y1 - half)
         things += _rooms(name, corners, y - y0 - half, rng)

@@ -13,8 +13,8 @@ import numpy as np
 
 from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
-from graphslam.core.geometry import Array, between
-from graphslam.core.motion_models import HELD_SIGMA, Calibration, several_lasers
+from graphslam.core.geometry import Array
+from graphslam.core.motion_models import HELD_SIGMA, Calibration
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Motion, Step, Trajectory
 from graphslam.estimation.calibration_graph import (
@@ -25,11 +25,7 @@ from graphslam.estimation.calibration_graph import (
 from graphslam.estimation.motion_arrays import at_calibration
 from graphslam.estimation.optimisation import CONVERGED_ERROR_ROUGH
 from graphslam.estimation.recorded_graph import ObservationNoise, Source
-from graphslam.odometry.calibration_jacobian import (
-    CalibratedSource,
-    at_estimated_motion,
-    by_latency,
-)
+from graphslam.odometry.calibration_jacobian import along_estimated_path
 from graphslam.odometry.preintegration import Track
 
 #: times that everything is solved: after the first the calibration moves by a tenth of its sigma
@@ -176,7 +172,7 @@ def recompute_motions(
     """Steps with motions by the tracks' calibration, except those from scan matching.
 
     What a calibration changes in them is as in the ``estimate`` of all their states, if there is
-    one, see `at_estimated_motion`. Where odometry does not cover a motion to its end, its
+    one, see `along_estimated_path`. Where odometry does not cover a motion to its end, its
     covariance is that of the missing part, which would be zero with the latency held.
     """
     motions: list[dict[str, Motion]] = [dict(step.motions) for step in steps]
@@ -193,14 +189,11 @@ def _recomputed(motions: Sequence[Motion], track: Track, states: Trajectory | No
     """Motions of one robot by its track's calibration."""
     if not motions:
         return []
-    ends = np.array([(m.start_ns, m.end_ns) for m in motions], dtype=np.int64)
-    new = track.motions(*ends.T)
-    new = dataclasses.replace(new, cov=new.cov + uncovered_covs(track, *ends.T))
+    begin, end = np.array([(m.start_ns, m.end_ns) for m in motions], dtype=np.int64).T
+    new = track.motions(begin, end)
+    new = dataclasses.replace(new, cov=new.cov + uncovered_covs(track, begin, end))
     if states is not None:
-        estimated = between(*(states.at(end) for end in ends.T))
-        d_cal = at_estimated_motion(CalibratedSource.of(track), new.delta, new.d_cal, estimated)
-        if track.is_mounted and not track.has_burst_stamps and not several_lasers(track.prior):
-            d_cal[:, :, -1] = by_latency(states, *ends.T)
+        d_cal = along_estimated_path(track, begin, end, new, states)
         new = dataclasses.replace(new, d_cal=d_cal)
     return [new.one(k, m.start_ns, m.end_ns) for k, m in enumerate(motions)]
 

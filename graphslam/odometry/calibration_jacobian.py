@@ -22,6 +22,7 @@ from graphslam.core.motion_models import (
     several_lasers,
 )
 from graphslam.core.records import Trajectory
+from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.mounted_motions import lever_to
 from graphslam.odometry.path_sums import LATENCY_STEP_NS
 from graphslam.odometry.preintegration import Track
@@ -71,7 +72,7 @@ def at_estimated_motion(
 ) -> Array:
     """Derivative (n, 3, p) of motions by the calibration of their source, at the estimated motion.
 
-    That by a latency stays, see `by_latency`.
+    That by a latency stays; see `along_estimated_path`.
 
     Args:
         source: of one robot; with several lasers the derivative stays as it is.
@@ -95,26 +96,40 @@ def at_estimated_motion(
     return d_cal
 
 
-def by_latency(states: Trajectory, start_ns: IntArray, end_ns: IntArray) -> Array:
-    """Derivative (n, 3) of motions of a sensor by its latency, /s, at the estimated velocities.
+def along_estimated_path(
+    track: Track, start_ns: IntArray, end_ns: IntArray, measured: Motions, states: Trajectory
+) -> Array:
+    """`at_estimated_motion` between states of a path, by a latency at the estimated velocities.
+
+    Those of noisy odometry are in the residuals too: where a time lies between two readings half of
+    the noise of one, so that latencies that put all times there would look likelier. Between states
+    of several lasers the derivative stays as it is.
 
     Args:
-        states: the estimated ones, of the sensor's frame.
+        track: the odometry, with the calibration of the motions.
         start_ns: (n,) times of states at which the motions begin.
         end_ns: (n,) the same of their ends.
+        measured: motions between them.
+        states: the estimated ones, of the frame at the track's mount.
     """
     moved = between(states.at(start_ns), states.at(end_ns))
+    source = CalibratedSource.of(track)
+    d_cal = at_estimated_motion(source, measured.delta, measured.d_cal, moved)
+    if not track.is_mounted or track.has_burst_stamps or several_lasers(track.calibration):
+        return d_cal
+    d_cal[:, :, -1] = _by_latency(states, start_ns, end_ns, moved)
+    return d_cal
+
+
+def _by_latency(states: Trajectory, start_ns: IntArray, end_ns: IntArray, moved: Array) -> Array:
+    """Derivative (n, 3), /s, of motions that ``moved`` so (n, 3) between states."""
     change = between(_earlier(states, start_ns), _earlier(states, end_ns)) - moved
     change[:, 2] = wrap(change[:, 2])
-    return change * (1e9 / LATENCY_STEP_NS)
+    return np.asarray(change * (1e9 / LATENCY_STEP_NS))
 
 
 def _earlier(states: Trajectory, times_ns: IntArray) -> Array:
-    """Poses (n, 3) `LATENCY_STEP_NS` before times, at the mean velocity around them.
-
-    The velocity at the very time would contain the noise of the odometry there, which is in the
-    residual as well.
-    """
+    """Poses (n, 3) `LATENCY_STEP_NS` before times, at the mean velocity around them."""
     first, last = states.stamps_ns[0], states.stamps_ns[-1]
     begin, end = (np.clip(times_ns + dt, first, last) for dt in (-BASELINE_NS, BASELINE_NS))
     moved = log(between(_interpolated(states, begin), _interpolated(states, end)))

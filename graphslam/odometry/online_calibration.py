@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from graphslam.core.arrays import BoolArray
 from graphslam.core.config import OdometryConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, solve
 from graphslam.core.geometry import Array, compose, wrap
@@ -24,6 +23,7 @@ from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
 from graphslam.core.records import Association, Motion
 from graphslam.odometry.calibration_jacobian import CalibratedSource, at_estimated_motion
+from graphslam.odometry.online_noise import NoiseEvidence, ShownNoise, scaled
 
 #: weight of the past per state: the memory is about 1 / (1 - FORGETTING_FACTOR) states, so that
 #: parameters may change slowly (tyres warm up)
@@ -35,85 +35,8 @@ MIN_SIGMA_SHARE = 0.5
 OUTLIER_D2 = float(chi2_quantile(0.999, 3))
 #: times that motions are left out as outliers, by the noise that the others show
 GATINGS = 2
-#: motions by the noise that is stated, beside those that show it
-NOISE_PRIOR_MOTIONS = 20
 #: no laser's mount is told
 NOTHING_TOLD: Mapping[str, Array] = MappingProxyType({})
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NoiseEvidence:
-    """How noisy odometry is beside what is stated, by tracked motions; that of several adds up.
-
-    ``squares`` and ``expected`` (3,): along each axis the sum of the squared errors of odometry
-    that ``count`` motions show, and what it would be by the noise that is stated; ``stated`` (3,)
-    the sum of the variances stated.
-    """
-
-    squares: Array
-    expected: Array
-    stated: Array
-    count: float
-
-    @classmethod
-    def none(cls) -> "NoiseEvidence":
-        """Nothing is known."""
-        return cls(np.zeros(3), np.zeros(3), np.zeros(3), 0)
-
-    @classmethod
-    def of(
-        cls, miss: Array, white: Array, by_calibration: Array, seen: Array, moved_cov: Array
-    ) -> "NoiseEvidence":
-        """That of motions, each alone: all fields but ``count`` are (n, 3).
-
-        The difference between a motion after tracking and by odometry is P O (z - m): its square is
-        expected to be P O (f Q + C + O⁻¹) O P where the noise is f times as stated.
-
-        Args:
-            miss: (n, 3) these differences.
-            white: (n, 3, 3) the noise Q that is stated.
-            by_calibration: (n, 3, 3) what the error of the calibration adds to it, C.
-            seen: (n, 3, 3) information of landmarks about the motions, O.
-            moved_cov: (n, 3, 3) covariances after tracking, P.
-        """
-        K = moved_cov @ seen
-        explained = _diagonal(K @ (by_calibration @ K.mT + moved_cov))
-        return cls(miss**2 - explained, _diagonal(K @ white @ K.mT), _diagonal(white), 1)
-
-    def with_motions(
-        self, found: "NoiseEvidence", used: BoolArray, past: float = 1.0
-    ) -> "NoiseEvidence":
-        """The same with those motions that are ``used`` (n,); the ``past`` may weigh less."""
-        return NoiseEvidence(
-            past * self.squares + found.squares[used].sum(axis=0),
-            past * self.expected + found.expected[used].sum(axis=0),
-            past * self.stated + found.stated[used].sum(axis=0),
-            past * self.count + float(used.sum()),
-        )
-
-    @property
-    def scale(self) -> Array:
-        """How many times (3,) the stated variances those of odometry are; not less than one."""
-        prior = NOISE_PRIOR_MOTIONS / max(self.count, 1.0) * self.stated
-        scale = (self.squares + prior) / np.maximum(self.expected + prior, 1e-300)
-        return np.asarray(np.maximum(scale, 1.0))
-
-    def applied(self, white: Array) -> Array:
-        """Covariances (n, 3, 3) of noise that is as large as it was found to be."""
-        sigmas = np.sqrt(self.scale)
-        return np.asarray(sigmas[:, None] * white * sigmas)
-
-
-def noisier(motion: Motion, calibration_cov: Array, scale: Array) -> Motion:
-    """A motion whose noise has variances that are a factor (3,) larger, as far as it is white."""
-    D, sigmas = motion.d_delta_d_calibration, np.sqrt(scale)
-    shared = D @ calibration_cov @ D.T
-    return replace(motion, cov=sigmas[:, None] * (motion.cov - shared) * sigmas + shared)
-
-
-def _diagonal(matrices: Array) -> Array:
-    """Diagonals (n, 3) of matrices (n, 3, 3)."""
-    return np.asarray(np.einsum("nii->ni", matrices))
 
 
 def _floor(config: OdometryConfig) -> Array:
@@ -170,7 +93,8 @@ class Calibrator:
         if miss @ solve(total, miss) > OUTLIER_D2 or not observed.any():
             return current
         if not self._is_noise_known:
-            D = self._learn_noise(source, motion, miss, white, observed)
+            self._learn_noise(miss, white, motion.cov, observed)
+            D = self._derivative_at_likeliest(source, motion, miss, white)
         # (noise + observed⁻¹)⁻¹, for an information matrix that may be singular
         noise = self._noise.applied(white) + self._floor
         W = solve(np.eye(3) + observed @ noise, observed)
@@ -184,17 +108,18 @@ class Calibrator:
             current.names, cov @ self._vector, cov + MIN_SIGMA_SHARE**2 * self._prior
         )
 
-    def _learn_noise(
-        self, source: CalibratedSource, motion: Motion, miss: Array, white: Array, observed: Array
+    def _learn_noise(self, miss: Array, white: Array, cov: Array, observed: Array) -> None:
+        """Take in how noisy one motion shows odometry to be."""
+        moved_cov = solve(np.eye(3) + cov @ observed, cov)
+        each = (one[None] for one in (miss, white, cov - white, observed, moved_cov))
+        used = np.ones(1, dtype=np.bool_)
+        self._noise = self._noise.with_motions(ShownNoise.of(*each), used, FORGETTING_FACTOR)
+
+    def _derivative_at_likeliest(
+        self, source: CalibratedSource, motion: Motion, miss: Array, white: Array
     ) -> Array:
-        """Measure the noise of odometry; derivative (3, p) at the likeliest motion by it."""
-        after = solve(np.eye(3) + motion.cov @ observed, motion.cov)
-        shared = motion.cov - white
-        each = (one[None] for one in (miss, white, shared, observed, after))
-        found = NoiseEvidence.of(*each)
-        self._noise = self._noise.with_motions(found, np.ones(1, dtype=bool), FORGETTING_FACTOR)
-        # neither odometry nor the estimate is without error
-        cov = self._noise.applied(white) + shared
+        """Derivative (3, p) at the likeliest motion: the estimate is not without error either."""
+        cov = self._noise.applied(white) + motion.cov - white
         likeliest = motion.delta + cov @ solve(cov + self._floor, miss)
         delta, d_cal = motion.delta[None], motion.d_delta_d_calibration[None]
         return np.asarray(at_estimated_motion(source, delta, d_cal, likeliest[None])[0])
@@ -294,12 +219,9 @@ class CalibrationEvidence:
         values, axes = np.linalg.eigh(0.5 * (seen + seen.mT))
         seen = (axes * np.maximum(values, 0.0)[:, None]) @ axes.mT
         by_calibration = D @ calibration.cov @ D.mT
-        sigmas = np.sqrt(found.noise_scale)
-        white = (found.cov - by_calibration) / (sigmas[:, None] * sigmas)
-        shown, noise = (
-            NoiseEvidence.of(miss, white, by_calibration, seen, found.moved_cov),
-            self.noise,
-        )
+        white = scaled(found.cov - by_calibration, 1.0 / found.noise_scale)
+        shown = ShownNoise.of(miss, white, by_calibration, seen, found.moved_cov)
+        noise = self.noise
         for _ in range(GATINGS):
             cov = noise.applied(white) + by_calibration + floor
             used = mahalanobis_squared(miss, cov) <= OUTLIER_D2

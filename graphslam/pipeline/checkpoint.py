@@ -52,7 +52,7 @@ _CLASSES = (
     ("odometry.increment_sums", "IncrementSums"),
     ("odometry.increment_sums", "PathSums"),
     ("odometry.online_calibration", "Calibrator"),
-    ("odometry.online_calibration", "NoiseEvidence"),
+    ("odometry.online_noise", "NoiseEvidence"),
     ("odometry.preintegration", "Track"),
     ("odometry.several_lasers", "SeveralLasersTrack"),
     ("pipeline.log_pass", "PriorKnowledge"),

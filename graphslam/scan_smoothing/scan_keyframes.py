@@ -27,7 +27,8 @@ from graphslam.odometry.calibration_jacobian import CalibratedSource
 from graphslam.odometry.gap_bridging import with_bridged_gaps
 from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.noise_estimation import is_stated
-from graphslam.odometry.online_calibration import Learnt, noisier
+from graphslam.odometry.online_calibration import Learnt
+from graphslam.odometry.online_noise import noisier
 from graphslam.odometry.scan_odometry import (
     MIN_POINTS,
     suspect_motions,

@@ -27,11 +27,7 @@ from graphslam.core.records import (
 )
 from graphslam.estimation.batch_calibration import uncovered_covs
 from graphslam.estimation.motion_noise import MIN_SIGMA
-from graphslam.odometry.calibration_jacobian import (
-    CalibratedSource,
-    at_estimated_motion,
-    by_latency,
-)
+from graphslam.odometry.calibration_jacobian import along_estimated_path
 from graphslam.odometry.increment_sums import Motions
 from graphslam.odometry.interpolation import final_at
 from graphslam.odometry.preintegration import Track, preintegrate_batch
@@ -264,18 +260,11 @@ def _at_least(cov: Array, variance: float) -> Array:
 def calibration_jacobian(
     track: Track, start_ns: IntArray, end_ns: IntArray, found: Motions, states: Trajectory
 ) -> Array:
-    """`at_estimated_motion` of motions whose sensor has a latency: (n, 3, p).
+    """`along_estimated_path` of a robot whose states are those of its base: (n, 3, p).
 
-    Args:
-        track: of a robot whose states are those of its base.
-        start_ns: (n,) times of states at which the motions begin.
-        end_ns: (n,) the same of their ends.
-        found: motions between them, as measured.
-        states: the estimated ones.
+    The derivative by the latency of a sensor that is mounted elsewhere stays as measured.
     """
-    moved = between(states.at(start_ns), states.at(end_ns))
-    d_cal = at_estimated_motion(CalibratedSource.of(track), found.delta, found.d_cal, moved)
-    at_base = np.abs(track.mount).max() < HELD_SIGMA  # held, but solutions have rounding
-    if track.is_mounted and at_base and not track.has_burst_stamps:
-        d_cal[:, :, -1] = by_latency(states, start_ns, end_ns)
+    d_cal = along_estimated_path(track, start_ns, end_ns, found, states)
+    if np.abs(track.mount).max() > HELD_SIGMA:  # where it is held solutions have rounding
+        d_cal[:, :, -1] = found.d_cal[:, :, -1]
     return d_cal

@@ -11,8 +11,8 @@ from graphslam.core.motion_models import rows_of_twists
 from graphslam.core.records import OdometryPose, Trajectory, WheelAngles
 from graphslam.odometry.calibration_jacobian import (
     CalibratedSource,
+    along_estimated_path,
     at_estimated_motion,
-    by_latency,
 )
 from graphslam.odometry.preintegration import Track
 
@@ -87,8 +87,11 @@ def test_noise_of_odometry_is_not_in_what_a_latency_changes():
     )
     ends = np.arange(2, READINGS // STATE_EVERY) * STATE_EVERY * (S // 10)
     states = Trajectory(ends, exact.pose(ends), np.zeros((len(ends), 3, 3)))
-    wanted, measured = (one.motions(ends[:-1], ends[1:]).d_cal[:, :, -1] for one in (exact, noisy))
-    made = by_latency(states, ends[:-1], ends[1:])
+    begin, end = ends[:-1], ends[1:]
+    wanted = exact.motions(begin, end).d_cal[:, :, -1]
+    found = noisy.motions(begin, end)
+    measured = found.d_cal[:, :, -1]
+    made = along_estimated_path(noisy, begin, end, found, states)[:, :, -1]
     inner = slice(2, -2)  # at its ends the path is not known on both sides
 
     def off(one):

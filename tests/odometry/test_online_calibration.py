@@ -20,9 +20,9 @@ from graphslam.odometry.online_calibration import (
     Calibrator,
     TrackedMotions,
     calibration_from_evidence,
-    noisier,
     observed_information,
 )
+from graphslam.odometry.online_noise import noisier
 from graphslam.odometry.preintegration import Track
 
 SECOND = 1_000_000_000
@@ -541,7 +541,9 @@ def test_noise_of_odometry_is_measured(times):
 
 
 def test_a_drive_by_noise_that_was_learnt_measures_the_same_noise():
-    """The scale is that of what is stated, whatever scale the motions had already."""
+    """The scale is that of what is stated, whatever scale the motions had already. Tracked by other
+    noise the same landmarks weigh differently, and other motions are near the gate: 10 %, where 120
+    motions tell a variance to 13 %."""
     drive, found = driven(3, 27.0), []
     for scale in (np.ones(3), np.array([1.0, 1.0, 9.0])):
         made = tracked_motions(drive, GOOD, np.random.default_rng(3))
