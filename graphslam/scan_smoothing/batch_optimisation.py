@@ -267,7 +267,9 @@ def _solved(
         estimate = moved_to(minimum.result(), estimate)
     # the minimum may have turned the map as a whole: ends of walls are where they are seen there
     landmarks.update_from(steps, estimate)
-    scan_log.displacements = displacements(steps, estimate, landmarks)
+    known_map = scan_log.known.known_map
+    places = known_map.places if known_map is not None else ()
+    scan_log.displacements = displacements(steps, estimate, landmarks, places)
     if paths.by:
         doubt_again(scan_log, estimate.states, paths.by)
     return estimate, steps

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from lab_log import lab
 from room_log import START_NS, drive, true_pose
 from walls import rectangles
 
@@ -29,11 +30,8 @@ FURNISHED = rectangles((0, 0, 10, 8), (4, 3.5, 6, 4.5), *ODD)
 #: the drive is 6 m long and 4.6 m wide
 SMALL = {"multi_robot.min_place_extent_m": 3.0}
 #: told to the first day, so that the map lies where the truth does
-START = {
-    "start.poses.robot": [5.0, 1.7, 0.0],
-    "start.given_sigma_m": 1e-3,
-    "start.given_sigma_rad": 1e-3,
-}
+SIGMAS = {"start.given_sigma_m": 1e-3, "start.given_sigma_rad": 1e-3}
+START = {"start.poses.robot": [5.0, 1.7, 0.0], **SIGMAS}
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +136,28 @@ def test_a_start_beside_the_map_is_a_doubt(tmp_path, first_day):
     assert found["known_map"]["seen"] == 0
     assert found["verdict"]["verdict"] == "doubtful"
     assert "no place of it is recognised" in found["verdict"]["reasons"][0]["text"]
+
+
+@pytest.mark.parametrize("is_continued", [False, True])
+def test_pushed_across_the_one_wall_in_sight_is_a_doubt(tmp_path, is_continued):
+    """All furniture of the lab was pushed by 10 cm across the west wall, the one of those walls
+    that both days see: the day lies as far off, and was good, as a map was not asked from which
+    side its walls were seen. Also in a map that was continued, whose first day's path is gone."""
+    pushed, stays = (0.1, 0.0), (0.0, 0.0)
+    days = ((stays, 2), (stays, 5), (pushed, 3))
+    logs = [lab(tmp_path / f"day{n}.mcap", *day, 1) for n, day in enumerate(days)]
+    told = {**SIGMAS, "start.poses.vehicle": [7.2, 1.6, np.pi / 2]}
+    graphslam.smooth(logs[0], output=tmp_path / "day0", **told)
+    known = tmp_path / "day0"
+    if is_continued:
+        known = tmp_path / "day1"
+        localised(logs[1], tmp_path / "day0", output=known, **told, **{"known_map.update": True})
+    result = localised(logs[2], known, **told)
+    errors = graphslam.evaluate(result)["robots"]["vehicle"]["final"]
+    assert errors["ate_rmse_m"] > 0.05  # else there would be nothing to doubt
+    (reason,) = result.summary["verdict"]["reasons"]
+    assert reason["check"] == "doubled walls"
+    assert "displaced alike by 0.10 m" in reason["text"]
 
 
 def test_the_map_of_a_localised_result_is_the_earlier_one(tmp_path, first_day):

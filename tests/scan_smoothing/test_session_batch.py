@@ -1,11 +1,11 @@
 """Sessions of one room, solved as one batch: joined by what the whole drives show, or refused."""
 
-from dataclasses import replace
 from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from lab_log import lab
 from room_log import START_NS, drive, true_pose
 from walls import rectangles
 
@@ -20,7 +20,6 @@ from graphslam.logs import open_logs, read_truth
 from graphslam.pipeline.log_kind import is_session_log
 from graphslam.pipeline.start_priors import start_poses
 from graphslam.results.report import render
-from graphslam.simulation import load_scenario, simulate
 from graphslam.slam.smooth import smooth
 
 BOX = (0, 0, 10, 8), (4, 3.5, 6, 4.5)
@@ -198,22 +197,6 @@ def test_a_session_lies_on_the_walls_and_not_on_what_was_pushed_alike(tmp_path):
     # biases of surfaces are 1 cm: where nothing was pushed up to 2 cm are left
     assert np.hypot(*(second - first)[:2]) < 0.03
     assert result.summary["verdict"]["verdict"] == "good", result.summary["verdict"]
-
-
-def lab(path, push_m, seed):
-    """The log of the simulated lab, all boxes and boards pushed by (2,) m."""
-    scenario = load_scenario("lab")
-
-    def pushed(things):
-        return tuple(
-            replace(one, center_m=tuple((one.center_m + push_m).tolist()), may_cross=True)
-            for one in things
-        )
-
-    world = scenario.world
-    world = replace(world, boxes=pushed(world.boxes), boards=pushed(world.boards))
-    simulate(replace(scenario, world=world), path, seed)
-    return path
 
 
 def test_where_nothing_changed_nothing_is_said(tmp_path):
