@@ -9,9 +9,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from graphslam.core.geometry import Array, between, compose, exp, log, transform_each, wrap
+from graphslam.core.arrays import IntArray
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    exp,
+    inverse,
+    log,
+    transform_each,
+    wrap,
+)
 from graphslam.core.record import replace
 from graphslam.core.records import Scan
+from graphslam.odometry.calibration_jacobian import CalibratedSource
 from graphslam.odometry.preintegration import Track
 
 
@@ -30,12 +41,24 @@ def undistorted_by_track(scans: Sequence[Scan], track: Track) -> list[Scan]:
     begin = np.array([scans[n].time_ns for n in swept], dtype=np.int64)
     end = np.array([sweep_end_ns(scans[n]) for n in swept], dtype=np.int64)
     mounts = np.array([scans[n].mount for n in swept])
-    sensor = scans[0].sensor
-    first, last = (compose(track.mounted_pose(times, sensor), mounts) for times in (begin, end))
-    velocities = log(between(first, last)) / (1e-9 * np.maximum(end - begin, 1))[:, None]
+    twists = _twists(track, begin, end, mounts, scans[0].sensor)
+    velocities = twists / (1e-9 * np.maximum(end - begin, 1))[:, None]
     for n, velocity in zip(swept, velocities, strict=True):
         found[n] = undistorted(scans[n], velocity)
     return found
+
+
+def _twists(
+    track: Track, begin_ns: IntArray, end_ns: IntArray, mounts: Array, sensor: str
+) -> Array:
+    """Twists (n, 3) of a laser with these mounts (n, 3), by odometry as it is calibrated now."""
+    error, late_ns = track.laser(sensor)
+    lasers = compose(error, mounts)
+    moved = between(track.pose(begin_ns - late_ns), track.pose(end_ns - late_ns))
+    if p := track.increment_parameters:
+        d_cal = CalibratedSource.of(track).derivative(log(moved))
+        moved = moved + d_cal @ track.calibration.mean[:p]
+    return log(compose(inverse(lasers), compose(moved, lasers)))
 
 
 def undistorted(scan: Scan, velocity: Array) -> Scan:
