@@ -57,6 +57,7 @@ SMALL: dict[str, list[str]] = {
     "without_odometry.py": ["lab", "--seeds", "1"],
     "workers.py": ["--only", "throughput", "--logs", "2"],
     "slipping_wheels.py": ["rounds", "--seeds", "1", "--slip", "0.02"],
+    "usual_robots.py": ["lab", "--lasers", "LDS-01", "--axle", "0.5", "--seeds", "1"],
     "wrong_odometry.py": ["--seeds", "1"],
     "yardstick.py": [],
 }

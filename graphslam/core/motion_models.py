@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from graphslam.core.arrays import IntArray
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import OdometryConfig, RobotConfig
 from graphslam.core.geometry import Array, compose, exp, exp_jacobian, inverse, rotation3, wrap
 
@@ -342,6 +342,11 @@ def further_calibration(
 def several_lasers(calibration: Calibration) -> bool:
     """Whether there are mounts of further lasers in a calibration."""
     return any("." in name for name in calibration.names)
+
+
+def of_odometry(calibration: Calibration) -> BoolArray:
+    """Which parameters (p,) are those of the odometry itself, not of mounts and latencies."""
+    return np.array(["laser_" not in name for name in calibration.names], dtype=np.bool_)
 
 
 def _laser_sigmas(config: OdometryConfig) -> dict[str, float]:

@@ -168,7 +168,7 @@ class Motion(Record):
     frame's axes. ``d_delta_d_calibration`` (3, p) is its derivative with respect to the motion
     source's p calibration parameters (see `graphslam.core.motion_models`); its part of ``cov`` is
     already included. ``length_m`` is the path driven. ``from_scans``: scans contradicted the
-    sensors and corrected the motion (`graphslam.odometry.scan_odometry`).
+    sensors and corrected the motion (`graphslam.odometry.scan_odometry`); ``contradiction``: how.
     """
 
     start_ns: int
@@ -178,6 +178,19 @@ class Motion(Record):
     d_delta_d_calibration: Array
     length_m: float
     from_scans: bool = False
+    contradiction: "Contradiction | None" = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contradiction(Record):
+    """What scans say against a motion by odometry, ``odometry``: ``pose`` (3,) is it by the scans.
+
+    ``information`` (3, 3) is what they tell about it, along its start's axes: nothing along walls.
+    """
+
+    odometry: Motion
+    pose: Array
+    information: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

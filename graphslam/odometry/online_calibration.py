@@ -18,11 +18,18 @@ import numpy as np
 from graphslam.core.config import OdometryConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, solve
 from graphslam.core.geometry import Array, compose, wrap
-from graphslam.core.motion_models import HELD_SIGMA, MOUNT_NAMES, Calibration, several_lasers
+from graphslam.core.motion_models import (
+    HELD_SIGMA,
+    MOUNT_NAMES,
+    Calibration,
+    several_lasers,
+)
 from graphslam.core.observation_models import MODELS
 from graphslam.core.record import replace
-from graphslam.core.records import Association, Motion
+from graphslam.core.records import Association, Contradiction, Motion
 from graphslam.odometry.calibration_jacobian import CalibratedSource, at_estimated_motion
+from graphslam.odometry.contradicted_motions import ContradictedMotions, calibration_floor
+from graphslam.odometry.far_calibration import explain, widened
 from graphslam.odometry.online_noise import NoiseEvidence, ShownNoise, scaled
 
 #: weight of the past per state: the memory is about 1 / (1 - FORGETTING_FACTOR) states, so that
@@ -33,33 +40,41 @@ MIN_SIGMA_SHARE = 0.5
 #: squared Mahalanobis distance beyond which a difference is no calibration error but a jump of the
 #: estimate (a loop closure) or a slip
 OUTLIER_D2 = float(chi2_quantile(0.999, 3))
+#: times that a calibration and the width of its prior are found in turn
+WIDENINGS = 4
+#: contradicted motions that are kept until a calibration explains them
+MOST_CONTRADICTED = 50
 #: times that motions are left out as outliers, by the noise that the others show
 GATINGS = 2
 #: no laser's mount is told
 NOTHING_TOLD: Mapping[str, Array] = MappingProxyType({})
 
 
-def _floor(config: OdometryConfig) -> Array:
-    """Covariance (3, 3) of what is wrong with a motion after tracking that odometry cannot tell."""
-    sigmas = [config.calibration_floor_m] * 2 + [config.calibration_floor_rad]
-    return np.diag(np.square(sigmas))
-
-
 class Calibrator:
-    """Recursive least squares over one robot's motions."""
+    """Recursive least squares over one robot's motions.
+
+    ``wider``: prior of the calibration, see `widened`, if motions that scans contradict tell that
+    it is far from the one before any data.
+    """
 
     def __init__(self, config: OdometryConfig, *, is_noise_known: bool = False) -> None:
         """Nothing learnt yet.
 
         ``is_noise_known``: odometry is as noisy as motions say; derivatives are as measured.
         """
-        self._floor, self._noise = _floor(config), NoiseEvidence.none()
+        self._floor, self._noise = calibration_floor(config), NoiseEvidence.none()
         self._is_noise_known = is_noise_known
-        self._prior: Array | None = None
+        self._before: Calibration | None = None
         self._info: Array = np.zeros((0, 0))
         self._prior_info: Array = np.zeros((0, 0))
         self._vector = np.zeros(0)
-        self._names: tuple[str, ...] = ()
+        self._contradicted = ContradictedMotions.none()
+        self.wider: Calibration | None = None
+
+    @property
+    def noise_scale(self) -> Array:
+        """By how much (3,) variances of the noise of odometry are larger than stated."""
+        return self._noise.scale
 
     def update(
         self, source: CalibratedSource, motion: Motion, moved: Array, observed: Array
@@ -78,18 +93,15 @@ class Calibrator:
             Mean, and the covariance to be used for coming motions.
         """
         D, current = motion.d_delta_d_calibration, source.calibration
+        if motion.contradiction is not None and current.names:
+            return self._with_contradiction(source, motion.contradiction)
         if motion.from_scans or not D.shape[1] or (motion.length_m == 0 and motion.delta[2] == 0):
             return current
-        if self._prior is None:
-            self._prior = current.cov
-            self._prior_info = np.asarray(np.linalg.inv(self._prior), dtype=np.float64)
-            self._info = self._prior_info
-            self._vector = np.zeros(D.shape[1])
-            self._names = current.names
+        before = self._begin(current)
         miss = moved - motion.delta
         miss[2] = wrap(miss[2])
         white = motion.cov - D @ current.cov @ D.T
-        total = self._noise.applied(white) + D @ self._prior @ D.T + self._floor
+        total = self._noise.applied(white) + D @ before.cov @ D.T + self._floor
         if miss @ solve(total, miss) > OUTLIER_D2 or not observed.any():
             return current
         if not self._is_noise_known:
@@ -103,10 +115,41 @@ class Calibrator:
         past = FORGETTING_FACTOR
         self._info = past * self._info + (1 - past) * self._prior_info + weighted @ D
         self._vector = past * self._vector + weighted @ (miss + D @ current.mean)
+        return self._solved(before)
+
+    def _begin(self, before: Calibration) -> Calibration:
+        """Take a calibration as that before any data, if there is none yet; the one there is."""
+        if self._before is None:
+            self._before = replace(before, mean=np.zeros(len(before.mean)))
+            self._prior_info = np.asarray(np.linalg.inv(before.cov), dtype=np.float64)
+            self._info, self._vector = self._prior_info, np.zeros(len(before.mean))
+            self._contradicted = ContradictedMotions.none()
+        return self._before
+
+    def _solved(self, before: Calibration) -> Calibration:
+        """The calibration by all that is known, and the covariance to be used for motions."""
+        found = self._found(before)
+        return replace(found, cov=found.cov + MIN_SIGMA_SHARE**2 * before.cov)
+
+    def _found(self, before: Calibration) -> Calibration:
         cov = solve(self._info, np.eye(len(self._info)))
-        return Calibration(
-            current.names, cov @ self._vector, cov + MIN_SIGMA_SHARE**2 * self._prior
-        )
+        return Calibration(before.names, cov @ self._vector, cov)
+
+    def _with_contradiction(self, source: CalibratedSource, found: Contradiction) -> Calibration:
+        """The calibration, with a motion that scans contradict, if one explains it and others."""
+        before = self._begin(source.calibration)
+        known = self._contradicted.with_motions([found], source, self._noise.scale)
+        told = explain(known, self._info, self._found(before).mean, before)
+        if told is None:
+            self._contradicted = known.those(slice(-MOST_CONTRADICTED, None))
+            return source.calibration
+        self._contradicted = known.those(~told.used)
+        self._info, self._vector = self._info + told.information, self._vector + told.vector
+        self.wider = widened(before, self._found(before))
+        information = np.asarray(np.linalg.inv(self.wider.cov), dtype=np.float64)
+        self._info = self._info + information - self._prior_info
+        self._prior_info = information
+        return self._solved(before)
 
     def _learn_noise(self, miss: Array, white: Array, cov: Array, observed: Array) -> None:
         """Take in how noisy one motion shows odometry to be."""
@@ -134,8 +177,8 @@ class Calibrator:
         Returns:
             See `update`.
         """
-        self._prior, self._names = prior.cov, prior.names
-        self._prior_info = np.asarray(np.linalg.inv(prior.cov), dtype=np.float64)
+        self._before = None
+        self._begin(prior)
         self._info = np.asarray(np.linalg.inv(found.cov), dtype=np.float64)
         self._vector = self._info @ found.mean
         return replace(found, cov=found.cov + MIN_SIGMA_SHARE**2 * prior.cov)
@@ -147,19 +190,22 @@ class Calibrator:
 
         The sigma refers to the memory of the filter, and to what `restart` was given.
         """
-        if self._prior is None:
+        if self._before is None:
             return {}
-        cov: Array = np.asarray(np.linalg.inv(self._info), dtype=np.float64)
-        known = Calibration(self._names, cov @ self._vector, cov)
-        return to_summary(known, self._prior, told)
+        return to_summary(self._found(self._before), self._before.cov, told)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Learnt:
-    """What a drive so far tells: the calibration, and a factor (3,) on variances of odometry."""
+    """What a drive so far tells: the calibration, and a factor (3,) on variances of odometry.
+
+    ``prior``: of the calibration; ``is_far``: it is wider than stated, see `widened`.
+    """
 
     calibration: Calibration
     noise_scale: Array
+    prior: Calibration
+    is_far: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,17 +233,26 @@ class CalibrationEvidence:
     """What motions tell about the p parameters: information (p, p), and that times the mean (p,).
 
     Both are sums over motions. ``noise``: what the same motions tell of the noise of odometry.
+    ``contradicted``: motions that scans contradict, which count if a calibration explains them.
     """
 
     information: Array
     vector: Array
     noise: NoiseEvidence
+    contradicted: ContradictedMotions
 
     @classmethod
     def none(cls, parameters: int) -> "CalibrationEvidence":
         """Nothing is known."""
         nothing = np.zeros(parameters)
-        return cls(np.diag(nothing), nothing, NoiseEvidence.none())
+        return cls(np.diag(nothing), nothing, NoiseEvidence.none(), ContradictedMotions.none())
+
+    def with_contradictions(
+        self, found: Sequence[Contradiction], source: CalibratedSource
+    ) -> "CalibrationEvidence":
+        """The same with motions that scans contradict, made by the calibration of a source."""
+        contradicted = self.contradicted.with_motions(found, source, self.noise.scale)
+        return replace(self, contradicted=contradicted)
 
     def with_motions(self, found: TrackedMotions, config: OdometryConfig) -> "CalibrationEvidence":
         """The same with further tracked motions, by how they differ from those of odometry.
@@ -213,7 +268,7 @@ class CalibrationEvidence:
         """
         miss = found.moved - found.delta
         miss[:, 2] = wrap(miss[:, 2])
-        D, calibration, floor = found.d_cal, found.source.calibration, _floor(config)
+        D, calibration, floor = found.d_cal, found.source.calibration, calibration_floor(config)
         after = np.linalg.inv(found.moved_cov)
         seen = after - np.linalg.inv(found.cov)
         values, axes = np.linalg.eigh(0.5 * (seen + seen.mT))
@@ -240,30 +295,41 @@ class CalibrationEvidence:
             self.information + (D.mT @ W @ D).sum(axis=0),
             self.vector + vector.sum(axis=0)[:, 0],
             noise,
+            self.contradicted,
         )
 
 
-def calibration_from_evidence(known: CalibrationEvidence, prior: Calibration) -> Calibration:
+def learnt_from_evidence(known: CalibrationEvidence, prior: Calibration) -> Learnt:
     """The calibration that explains best what motions tell, by least squares.
 
-    Returns:
-        Mean, and the covariance to be used for motions, see `MIN_SIGMA_SHARE`.
+    Its covariance is the one to be used for motions, see `MIN_SIGMA_SHARE`.
     """
     free = np.flatnonzero(np.diag(prior.cov) > HELD_SIGMA**2)
     if not len(free):
-        return prior
+        return Learnt(prior, known.noise.scale, prior)
     block = np.ix_(free, free)
-    information = np.linalg.inv(prior.cov[block])
-    cov = np.linalg.inv(information + known.information[block])
-    mean, all_cov = prior.mean.copy(), prior.cov.copy()
     held = np.setdiff1d(np.arange(len(prior.mean)), free)
     told = known.vector[free] - known.information[np.ix_(free, held)] @ prior.mean[held]
-    mean[free] = cov @ (information @ prior.mean[free] + told)
+    wider = prior
+    for _ in range(WIDENINGS):
+        before = np.linalg.inv(wider.cov[block])
+        information, vector = before + known.information[block], before @ prior.mean[free] + told
+        mean, about, cov = prior.mean.copy(), np.zeros_like(prior.cov), np.linalg.inv(information)
+        mean[free], about[block] = cov @ vector, information
+        also = explain(known.contradicted, about, mean, prior)
+        if also is None:
+            wider = prior
+            break
+        cov = np.linalg.inv(information + also.information[block])
+        mean[free] = cov @ (vector + also.vector[free])
+        wider = widened(prior, replace(prior, mean=mean))
+    all_cov = prior.cov.copy()
     # between states of two lasers the mounts' covariance enters every motion, as if it were fresh
     rigid = [several_lasers(prior) and "laser_" in prior.names[k] for k in free]
     share = np.where(rigid, 0.0, MIN_SIGMA_SHARE)
     all_cov[block] = cov + share[:, None] * prior.cov[block] * share
-    return Calibration(prior.names, mean, all_cov)
+    found = Calibration(prior.names, mean, all_cov)
+    return Learnt(found, known.noise.scale, wider, wider is not prior)
 
 
 def to_summary(

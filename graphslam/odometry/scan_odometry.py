@@ -18,7 +18,7 @@ from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import ScanMatchingConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, symmetric, update
 from graphslam.core.geometry import Array, rotation, wrap
-from graphslam.core.records import Closure, Motion, Observation
+from graphslam.core.records import Closure, Contradiction, Motion, Observation
 from graphslam.perception.scan_matching import (
     Submap,
     agreement,
@@ -162,7 +162,9 @@ def _corrected(motion: Motion, pose: Array, cov: Array, config: ScanMatchingConf
     if is_small or mahalanobis_squared(off, motion.cov + cov) < CONTRADICTION_D2:
         return motion
     inflated = replace(motion, cov=motion.cov + np.outer(off, off))
-    return fused(inflated, axes.T, np.diag(variances), measured_off)
+    corrected = fused(inflated, axes.T, np.diag(variances), measured_off)
+    information = (axes / variances) @ axes.T
+    return replace(corrected, contradiction=Contradiction(motion, pose, information))
 
 
 def is_suspect(share: float, step: Array, cov: Array) -> bool:

@@ -49,9 +49,11 @@ _MODULES = (
 )  # fmt: skip
 _CLASSES = (
     ("mapping.landmark_map", "LandmarkMap"),
+    ("odometry.contradicted_motions", "ContradictedMotions"),
     ("odometry.increment_sums", "IncrementSums"),
     ("odometry.increment_sums", "PathSums"),
     ("odometry.online_calibration", "Calibrator"),
+    ("odometry.online_calibration", "Learnt"),
     ("odometry.online_noise", "NoiseEvidence"),
     ("odometry.preintegration", "Track"),
     ("odometry.several_lasers", "SeveralLasersTrack"),

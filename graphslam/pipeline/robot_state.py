@@ -1,7 +1,7 @@
 """What a pass accumulates for one robot, and the trajectories made of it."""
 
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,9 +10,10 @@ from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.geometry import Array, between, compose, inverse
 from graphslam.core.motion_models import Calibration
 from graphslam.core.mount_covariances import MountCovariance
-from graphslam.core.records import Motion, RobotResult, Scan, Trajectory
+from graphslam.core.records import Motion, RobotResult, Scan, Step, Trajectory
 from graphslam.logs.clock import Clock
 from graphslam.odometry.calibration_jacobian import CalibratedSource
+from graphslam.odometry.contradicted_motions import without_explained
 from graphslam.odometry.interpolation import (
     BetterScans,
     causal_at,
@@ -120,6 +121,17 @@ class RobotState:
         self.track.calibration = self.calibrator.update(
             CalibratedSource.of(self.track), motion, moved, observed
         )
+
+    def without_explained(self, steps: Iterable[Step], robot: str, scale: Array) -> list[Step]:
+        """Steps without the contradictions that the calibration found explains.
+
+        Arguments are those of `graphslam.odometry.contradicted_motions.without_explained`.
+        """
+        taken = without_explained(steps, robot, self.track, scale)
+        self.contradicted = sum(
+            step.motions[robot].from_scans for step in taken if robot in step.motions
+        )
+        return taken
 
     def is_causal(self, states: Trajectory) -> bool:
         """Whether final ``states`` equal the causal ones, as those of a filter do."""

@@ -32,9 +32,9 @@ UNCALIBRATED_BLOCKS = 2
 READ_AHEAD, BATCH = 20_000, 256
 
 
-def read_ahead(log: LogSet, config: Config) -> Reading:
-    """Keyframes of a log for which `is_scan_log` holds."""
-    return Exchange(lambda: _keyframes(log, config), UNCALIBRATED_BLOCKS * (None,))
+def read_ahead(log: LogSet, config: Config, known: Learnt | None = None) -> Reading:
+    """Keyframes of a log for which `is_scan_log` holds; ``known``: see `read_keyframes`."""
+    return Exchange(lambda: _keyframes(log, config, known), UNCALIBRATED_BLOCKS * (None,))
 
 
 def open_ahead(open_log: Callable[[], LogSet], config: Config) -> Reading:
@@ -80,7 +80,9 @@ def _received(reading: Reading, batches: int) -> Iterator[Message | ReadReport]:
         yield from unpacked(batch)
 
 
-def _keyframes(log: LogSet, config: Config) -> Generator[LogSet | ReadItem, Learnt | None, None]:
+def _keyframes(
+    log: LogSet, config: Config, known: Learnt | None = None
+) -> Generator[LogSet | ReadItem, Learnt | None, None]:
     from graphslam.scan_smoothing.scan_keyframes import read_keyframes  # noqa: PLC0415 (see above)
 
-    return read_keyframes(log, config, UNCALIBRATED_BLOCKS)
+    return read_keyframes(log, config, UNCALIBRATED_BLOCKS, known)

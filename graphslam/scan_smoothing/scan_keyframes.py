@@ -110,14 +110,15 @@ ReadItem = KeyframeBlock | ReadLog | AwaitCalibration
 
 
 def read_keyframes(
-    log: LogSet, config: Config, uncalibrated: int
+    log: LogSet, config: Config, uncalibrated: int, known: Learnt | None = None
 ) -> Generator[LogSet | ReadItem, Learnt | None, None]:
     """The keyframes of the only robot of a log, and last a `ReadLog`.
 
     What is sent is the calibration for later motions, and their noise. After ``uncalibrated``
     blocks it is waited for: before, some of what follows is read, then comes a `AwaitCalibration`.
+    ``known``: what is sent before the first block, with its prior.
     """
-    reader = _Reader(log, with_noted_keyframes(log, config), log.robots[0])
+    reader = _Reader(log, with_noted_keyframes(log, config), log.robots[0], known)
     for number, block in enumerate(reader.blocks(), 1):
         found = yield block
         if number == uncalibrated:
@@ -169,8 +170,8 @@ class _Image(NamedTuple):
 class _Reader:
     """What is kept from block to block."""
 
-    def __init__(self, log: LogSet, config: Config, robot: str) -> None:
-        self._log, self._config, self._robot = log, config, robot
+    def __init__(self, log: LogSet, config: Config, robot: str, known: Learnt | None) -> None:
+        self._log, self._config, self._robot, self._known = log, config, robot, known
         self.run = RobotState(make_tracks(log, config)[robot])
         #: by laser: what the selection of its keyframes needs; the first one's is the robot's
         sensors = log.sensors(robot).values()
@@ -239,6 +240,10 @@ class _Reader:
             if self._state_ns is None:
                 # the first state is where odometry begins, or earlier
                 self._state_ns = first_ns = min(track.first_ns, block[0].time_ns)
+            if self._known is not None:  # now that the source of the motion is known
+                track.prior = self._known.prior
+                self.learn(self._known)
+                self._known = None
             source = CalibratedSource.of(track)
             keyframes, pairs, last = self._of_block(block)
             yield KeyframeBlock(

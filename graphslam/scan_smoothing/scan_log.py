@@ -17,13 +17,20 @@ from graphslam.scan_smoothing.scan_tracking import ScanLog
 def track_scan_log(
     job: SmoothingJob, known: PriorKnowledge, ahead: Reading | None = None, first: int = 0
 ) -> ScanLog:
-    """A log that is read and tracked, see `solve_scan_log`; ``first``: number of its landmarks."""
+    """A log that is read and tracked, see `solve_scan_log`; ``first``: number of its landmarks.
+
+    Where odometry is far off, it is read once more: motions before that was known, and scans that
+    were corrected for the motion during their sweeps, were wrong.
+    """
     scan_log = ScanLog(job.log, job.config, known, first)
     job.kept.read_pass(scan_log, partial(scan_log.run, job.progress, ahead))
     if scan_log.wrong_lasers:
         used = job.log.without_lasers(scan_log.wrong_lasers)
         scan_log = ScanLog(used, job.config, known, first)
         job.kept.read_pass(scan_log, partial(scan_log.run, job.progress))
+    if (learnt := scan_log.far) is not None:
+        scan_log = ScanLog(scan_log.log, job.config, known, first)
+        job.kept.read_pass(scan_log, partial(scan_log.run, job.progress, before=learnt))
     return scan_log
 
 

@@ -20,7 +20,7 @@ from graphslam.odometry.online_calibration import (
     CalibrationEvidence,
     Learnt,
     TrackedMotions,
-    calibration_from_evidence,
+    learnt_from_evidence,
 )
 from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.log_pass import LogPass, PriorKnowledge, Progress, timed
@@ -111,15 +111,20 @@ class ScanLog(TrackedLog):
         self._first = first if known_map is None else known_map.next_number  # of its landmarks
         #: see `ReadLog`
         self.wrong_lasers: dict[str, float] = {}
+        #: what was learnt, if the calibration is far from its prior
+        self.far: Learnt | None = None
 
-    def run(self, progress: Progress, ahead: Reading | None = None) -> None:
+    def run(
+        self, progress: Progress, ahead: Reading | None = None, before: Learnt | None = None
+    ) -> None:
         """Take in every message of the log; ``progress`` gets the number of messages read.
 
-        ``ahead``: the keyframes, if they are read already.
+        ``ahead``: the keyframes, if they are read already. ``before``: what a pass before this one
+        has learnt.
         """
         known: CalibrationEvidence | None = None
         learnt: Learnt | None = None
-        with ahead or read_ahead(self.log, self.given_config) as reading:
+        with ahead or read_ahead(self.log, self.given_config, before) as reading:
             while (item := reading.receive()) is not None:
                 if isinstance(item, ReadLog):
                     self._finish(item, learnt)
@@ -131,8 +136,7 @@ class ScanLog(TrackedLog):
                 if self.config.odometry.calibrate:
                     with timed(self.seconds, "calibration"):
                         known = self._evidence(item, moved, known)
-                        calibration = calibration_from_evidence(known, item.prior)
-                        learnt = Learnt(calibration, known.noise.scale)
+                        learnt = learnt_from_evidence(known, item.prior)
                 # the next block is being read; this is for the one after it
                 reading.send(learnt)
                 if moved:
@@ -196,6 +200,8 @@ class ScanLog(TrackedLog):
     ) -> CalibrationEvidence:
         """What the motions so far tell about the calibration, with those of a block."""
         known = known or CalibrationEvidence.none(len(block.prior.mean))
+        against = [m.contradiction for m, _, _ in tracked if m is not None and m.contradiction]
+        known = known.with_contradictions(against, block.source)
         used = [(m, at, cov) for m, at, cov in tracked if m is not None and not m.from_scans]
         if not used:
             return known
@@ -231,6 +237,11 @@ class ScanLog(TrackedLog):
         if path.anchors[-1] != len(path.times) - 1:
             path.anchors.append(len(path.times) - 1)
         if self.config.odometry.calibrate:
+            if learnt is not None and learnt.is_far:
+                self.far = learnt
+                run.track.prior = learnt.prior
+                self.steps = run.without_explained(self.steps, self._robot, learnt.noise_scale)
+                path.motions = [step.motions[self._robot] for step in self.steps if step.motions]
             recalibrate_path(path, run.track)
         tracker.retire_all()
         self.landmarks.add_all(tracker.entries)

@@ -126,6 +126,11 @@ def reoptimise(pipeline: Pipeline, estimate: Estimate) -> Estimate:
     unused = robots.unused(pipeline.steps)
     pipeline.steps = list(robots.associated_again(pipeline.steps, estimate, config.robust, config))
     pipeline.landmarks.bring_back()
+    for name, run in pipeline.started.items():
+        if config.odometry.calibrate and (wider := run.calibrator.wider) is not None:
+            run.track.prior = wider
+            scale = run.calibrator.noise_scale
+            pipeline.steps = run.without_explained(pipeline.steps, name, scale)
     if is_sighting_log(pipeline):
         estimate, steps = solve_unnamed(pipeline, estimate)
     else:

@@ -19,7 +19,7 @@ from graphslam.odometry.online_calibration import (
     CalibrationEvidence,
     Calibrator,
     TrackedMotions,
-    calibration_from_evidence,
+    learnt_from_evidence,
     observed_information,
 )
 from graphslam.odometry.online_noise import noisier
@@ -392,7 +392,7 @@ def test_a_robot_that_stands_teaches_nothing():
 def calibrated(found, prior):
     nothing = CalibrationEvidence.none(len(prior.mean))
     known = nothing.with_motions(found, OdometryConfig())
-    return calibration_from_evidence(known, prior)
+    return learnt_from_evidence(known, prior).calibration
 
 
 # ------------------------------------------------------------ all motions at once

@@ -128,7 +128,7 @@ def white_noise_of_motions(noise_scale, *settings):
         for motion in (k.motion for k in item.keyframes if k.motion is not None):
             D = motion.d_delta_d_calibration
             found.append(np.diag(motion.cov - D @ item.source.calibration.cov @ D.T))
-        item = reading.send(Learnt(item.source.calibration, noise_scale))
+        item = reading.send(Learnt(item.source.calibration, noise_scale, item.prior))
     return np.array(found)
 
 
