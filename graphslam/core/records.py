@@ -183,9 +183,9 @@ class Motion(Record):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contradiction(Record):
-    """What scans say against a motion by odometry, ``odometry``: ``pose`` (3,) is it by the scans.
+    """A motion by ``odometry``, and the same motion by scans that contradict it: ``pose`` (3,).
 
-    ``information`` (3, 3) is what they tell about it, along its start's axes: nothing along walls.
+    ``information`` (3, 3) of scans about it, along its start's axes: singular in a corridor.
     """
 
     odometry: Motion

@@ -237,11 +237,7 @@ class ScanLog(TrackedLog):
         if path.anchors[-1] != len(path.times) - 1:
             path.anchors.append(len(path.times) - 1)
         if self.config.odometry.calibrate:
-            if learnt is not None and learnt.is_far:
-                self.far = learnt
-                run.track.prior = learnt.prior
-                self.steps = run.without_explained(self.steps, self._robot, learnt.noise_scale)
-                path.motions = [step.motions[self._robot] for step in self.steps if step.motions]
+            self.far = learnt if learnt is not None and learnt.is_far else None
             recalibrate_path(path, run.track)
         tracker.retire_all()
         self.landmarks.add_all(tracker.entries)

@@ -11,14 +11,13 @@ from graphslam.core.motion_models import nominal_calibration
 from graphslam.core.records import Contradiction, Motion, Step
 from graphslam.odometry.calibration_jacobian import CalibratedSource
 from graphslam.odometry.contradicted_motions import (
-    MOST_KEPT,
     ContradictedMotions,
     without_explained,
 )
 from graphslam.odometry.far_calibration import FAR_SIGMAS, explain, widened
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.scan_odometry import CONTRADICTION_D2
-from tests.odometry.test_online_calibration import CENTRED, NOTHING, STATE_NS, Drive, weaving
+from tests.odometry.test_online_calibration import CENTRED, NOTHING, Drive, weaving
 
 PRIOR = nominal_calibration("odometry", OdometryConfig(), mounted=True)
 #: what scans tell of a motion: 1 cm and 0.01 rad
@@ -69,13 +68,12 @@ def test_a_robot_that_skids_is_calibrated_though_scans_contradict_its_turns(turn
     rng = np.random.default_rng(3)
     drive = Drive(weaving(2000, rng), {**NOTHING, "rotation_scale": turning}, CENTRED)
     steps = contradicted(drive, rng, slips=slips)
-    known, found = explanation(drive, steps)
+    _, found = explanation(drive, steps)
     mean, sigma = value(found)
     at = PRIOR.names.index("rotation_scale")
     assert abs(mean[at] - turning) < 4.0 * sigma[at] + 0.01
     assert sigma[at] < 0.04
     assert found.used.mean() > (0.6 if slips else 0.95)
-    assert len(known.miss) <= MOST_KEPT
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -124,7 +122,6 @@ def test_contradictions_that_the_calibration_explains_are_odometry_again_and_sli
     assert sum(before) > 20
     assert after == [slipped]
     assert [s.time_ns for s in taken] == [s.time_ns for s in steps]
-    assert np.diff([s.time_ns for s in taken]).max() == STATE_NS
 
 
 def test_a_prior_is_wider_only_for_the_odometry_and_only_beyond_its_tails():
