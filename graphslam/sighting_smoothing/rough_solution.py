@@ -13,11 +13,14 @@ import numpy as np
 
 from graphslam.core.config import Config, RobustConfig
 from graphslam.core.geometry import Array, between, compose
-from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.estimation.batch_calibration import calibrate_roughly
 from graphslam.mapping.landmark_map import observed_from
 from graphslam.odometry.preintegration import Track
+from graphslam.sighting_smoothing.misplaced_landmarks import (
+    seen_at,
+    with_landmarks_placed_again,
+)
 from graphslam.sighting_smoothing.reoptimise_sightings import SightingGroup, recompute_steps
 
 #: how much wider the kernel is in the beginning
@@ -151,10 +154,7 @@ def with_landmarks(
     landmarks = dict(known)
     for landmark in sorted(set(number.tolist()) - landmarks.keys()):
         own = np.flatnonzero(number == landmark)
-        model, z = MODELS[seen[own[0]].model], np.array([seen[k].z for k in own])
-        found = model.invert(z, x[own])
-        # the first one's direction: there is no median of angles
-        mean = np.append(np.median(found[:, :2], axis=0), found[0, 2:])
+        mean = seen_at([seen[k] for k in own], x[own])
         landmarks[landmark] = (mean, np.full((len(mean),) * 2, np.nan))
     return Estimate(states, landmarks, 0.0, 0), made
 
@@ -162,9 +162,9 @@ def with_landmarks(
 def _solved(problem: RoughProblem, states: Mapping[str, Trajectory], known: Landmarks) -> Estimate:
     """A rough estimate from initial ``states``, and landmarks where they are ``known``."""
     start, made = with_landmarks(problem, states, known)
-    return calibrate_roughly(
-        made, start, problem.tracks, widened_kernel(problem.config.robust), ROUNDS
-    )
+    kernel = widened_kernel(problem.config.robust)
+    estimate = calibrate_roughly(made, start, problem.tracks, kernel, ROUNDS)
+    return with_landmarks_placed_again(made, estimate, kernel)
 
 
 def widened_kernel(kernel: RobustConfig) -> RobustConfig:

@@ -14,6 +14,7 @@ from graphslam.core.records import Estimate, Step
 from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
 from graphslam.mapping.point_reassociation import PointSightings, is_point, reassociated
 from graphslam.pipeline.log_pass import LogPass
+from graphslam.sighting_smoothing.misplaced_landmarks import with_landmarks_placed_again
 from graphslam.sighting_smoothing.sensor_calibration import solved_with_sensors
 from graphslam.sighting_smoothing.sighting_noise import estimate_noise
 from graphslam.sighting_smoothing.state_at_every_sighting import FineSolution, SightingProblem
@@ -40,6 +41,7 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
     if not config.odometry.calibrate:
         return estimate, tuple(one.steps)
     before = len(estimate.landmarks)
+    estimate = with_landmarks_placed_again(one.steps, estimate, config.robust)
 
     def solve(start: Estimate) -> FineSolution:
         noise = estimate_noise(one.steps, one.sources, start, tracks, config)

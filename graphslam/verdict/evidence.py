@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from graphslam.core.arrays import BoolArray, IntArray
+from graphslam.core.config import RobustConfig
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, between, wrap
 from graphslam.core.observation_models import MODELS
@@ -122,7 +123,7 @@ class Evidence:
     ``without_odometry``: robots whose motion is that of their scans. ``observed``: whether an
     observation or a closure is in the estimate. ``closures``: how well these fit; None without.
     ``told``: the starts that the user gave. ``displacements`` of visits from
-    where walls of the building were seen before.
+    where walls of the building were seen before. ``kernel`` of the last solution.
     """
 
     robots: tuple[RobotEvidence, ...]
@@ -133,6 +134,7 @@ class Evidence:
     closures: ClosureMisfits | None = None
     told: tuple[ToldStart, ...] = ()
     displacements: Mapping[str, Displacement] = field(default_factory=dict)
+    kernel: RobustConfig = field(default_factory=RobustConfig)
 
     @property
     def begin_ns(self) -> int:
@@ -194,7 +196,7 @@ def gather(
     told = told_starts(pipeline, steps, estimate)
     return Evidence(
         tuple(found), summary, innovations, by_scans_alone, observed, misfits, told,
-        pipeline.displacements,
+        pipeline.displacements, pipeline.kernel,
     )  # fmt: skip
 
 

@@ -6,7 +6,8 @@ whom. The thresholds are far from what healthy logs show, see docs/reliability.m
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
@@ -16,6 +17,7 @@ from graphslam.estimation.log_noise import MOTION
 from graphslam.logs.time_order import TOO_LATE
 from graphslam.verdict.doubts import Reason, seconds
 from graphslam.verdict.evidence import Evidence
+from graphslam.verdict.gross_errors import gross_error_facts, without_harmless
 from graphslam.verdict.moved_points import moved_doubts
 from graphslam.verdict.odometry_doubts import odometry_doubts
 from graphslam.verdict.regular_landmarks import regular_landmark_doubts
@@ -46,13 +48,19 @@ _NONE: Mapping[str, float] = MappingProxyType({})
 
 
 def judge(evidence: Evidence) -> dict[str, Any]:
-    """The key ``verdict`` of summary.json: the worst of what all `CHECKS` say, and all of it."""
-    reasons = [reason for check in CHECKS.values() for reason in check(evidence)]
-    return to_summary(reasons)
+    """The key ``verdict`` of summary.json: the worst of what all `CHECKS` say, and all of it.
+
+    Gross errors that do no harm are facts, and no check sees them.
+    """
+    facts = [asdict(fact) for fact in gross_error_facts(evidence)]
+    rest = without_harmless(evidence)
+    return to_summary((r for check in CHECKS.values() for r in check(rest)), facts)
 
 
-def to_summary(reasons: Iterable[Reason]) -> dict[str, Any]:
-    """The key ``verdict`` for these reasons."""
+def to_summary(
+    reasons: Iterable[Reason], facts: Sequence[Mapping[str, Any]] = ()
+) -> dict[str, Any]:
+    """The key ``verdict`` for these reasons, and facts that are none."""
     told = sorted(reasons, key=lambda reason: reason.level != "bad")
     level = "good" if not told else "bad" if told[0].level == "bad" else "doubtful"
     return {
@@ -61,6 +69,7 @@ def to_summary(reasons: Iterable[Reason]) -> dict[str, Any]:
             {"level": one.level, "check": one.check, "about": one.about, "text": one.text}
             for one in told
         ],
+        "facts": list(facts),
     }
 
 
@@ -89,7 +98,7 @@ def with_truth(
             times = f"{math.sqrt(nees):.0f} times what the covariances say"
             text = f"{name}: its errors against the truth in the log are {times}"
             reasons.append(Reason(level, "truth", name, text))
-    return to_summary(reasons)
+    return to_summary(reasons, verdict.get("facts", ()))
 
 
 def _level(value: float, limits: tuple[float, float]) -> str | None:

@@ -1,0 +1,142 @@
+"""Gross errors of sightings that a robust kernel is there for, and those that it cannot tell apart.
+
+A kernel whose weights fall faster than residuals grow follows the majority: a few false detections,
+each by itself, pull less the further off they are. It does not help where most of what is seen for
+a moment, or of one landmark, is wrong, nor does it say that a landmark was moved. The first are
+facts about a sensor, the others reasons to doubt the result.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.special import bdtrc
+
+from graphslam.core.arrays import BoolArray
+from graphslam.core.config import RobustConfig
+from graphslam.core.geometry import Array, polar_points, transform_each
+from graphslam.estimation.m_estimators import WEIGHTS
+from graphslam.verdict.doubts import MOVED_M
+from graphslam.verdict.evidence import Evidence, Seen
+from graphslam.verdict.moved_points import APART
+
+#: squared distance per degree of freedom, and weight by the kernel, of a gross error
+FAR, WEIGHT = 25.0, 0.1
+#: of a robot's sightings: with a larger share of gross errors none is taken for harmless
+MOST = 0.1
+#: share of a stretch of sightings, or of a landmark's, that the kernel cannot be trusted with, and
+#: gross errors that are too few to say so
+MAJORITY, LEAST = 0.4, 6
+#: sightings in a stretch, and how likely any of all stretches may look like that by chance
+STRETCHES = (5, 10, 20, 50, 100, 200)
+CHANCE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """What a user may want to know of a robot (``about``) though it is no reason for doubt.
+
+    ``share`` of its sightings.
+    """
+
+    about: str
+    share: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GrossErrors:
+    """Sightings (n,) of a robot that are gross errors, and those of them that do no harm."""
+
+    gross: BoolArray
+    harmless: BoolArray
+
+
+def find_gross_errors(seen: Seen, kernel: RobustConfig) -> GrossErrors:
+    """Of a robot's sightings (n), under the kernel that the estimate was found with."""
+    weigh = WEIGHTS[kernel.kernel]
+    d2, dof = seen.d2, seen.z.shape[1]
+    # points without names are gated before, those in the map again are for `vanished_points`
+    nameless = np.array([not name for name in seen.names])[seen.targets] & seen.stands
+    gross = (d2 > FAR) & ~nameless
+    far = np.sqrt(dof * d2[gross]).tolist()
+    gross[gross] = [weigh(d, kernel.scale) < WEIGHT for d in far]
+    if not gross.any() or gross.mean() > MOST:
+        return GrossErrors(gross, np.zeros_like(gross))
+    return GrossErrors(gross, gross & ~_in_stretch(gross) & ~_of_doubted_targets(seen, gross))
+
+
+def _in_stretch(gross: BoolArray) -> BoolArray:
+    """Which (n,) are in a stretch of the log of which too many are gross errors for chance."""
+    n, share = len(gross), float(gross.mean())
+    change = np.zeros(n + 1, dtype=np.int64)  # of the number of such stretches around a sighting
+    total = np.append(0, np.cumsum(gross))
+    for length in STRETCHES:
+        if length > n:
+            break
+        count = total[length:] - total[:-length]
+        by_chance = bdtrc(count - 1.0, length, share)
+        many = (count > MAJORITY * length) & (by_chance < CHANCE / (n * len(STRETCHES)))
+        change[: n + 1 - length] += many
+        change[length:] -= many
+    return np.asarray(np.cumsum(change[:-1]) > 0)
+
+
+def _of_doubted_targets(seen: Seen, gross: BoolArray) -> BoolArray:
+    """Which (n,) are of something that is mostly elsewhere, or at one other place now and then."""
+    count = np.bincount(seen.targets)
+    wrong = np.bincount(seen.targets[gross], minlength=len(count))
+    doubted = (wrong >= LEAST) & (wrong > MAJORITY * count)
+    at = transform_each(seen.poses, polar_points(seen.z[:, 1], seen.z[:, 0]))
+    for target in np.flatnonzero((wrong >= LEAST) & ~doubted).tolist():
+        own = seen.targets == target
+        doubted[target] = _at_another_place(at[own & gross], at[own & ~gross])
+    return np.asarray(doubted[seen.targets])
+
+
+def _at_another_place(wrong: Array, right: Array) -> bool:
+    """Whether places (m, 2) agree with each other, but not with those (n, 2) that are right."""
+    place = np.median(wrong, axis=0)
+    spread = float(np.median(np.hypot(*(wrong - place).T)))
+    away = float(np.hypot(*(place - np.median(right, axis=0))))
+    return away > max(MOVED_M, APART * spread)
+
+
+def without_harmless(evidence: Evidence) -> Evidence:
+    """The evidence without the gross errors that do no harm."""
+    robots, error, dof = [], 0.0, 0
+    for robot in evidence.robots:
+        left_out = find_gross_errors(robot.seen, evidence.kernel).harmless
+        robots.append(replace(robot, seen=_only(robot.seen, ~left_out)))
+        rows = robot.seen.z.shape[1]
+        error += 0.5 * rows * float(robot.seen.d2[left_out].sum())
+        dof += rows * int(left_out.sum())
+    if not dof:
+        return evidence
+    graph = evidence.summary["graph"]
+    graph = {
+        **graph,
+        "error_without_kernels": graph["error_without_kernels"] - error,
+        "dof": graph["dof"] - dof,
+    }
+    return replace(evidence, robots=tuple(robots), summary={**evidence.summary, "graph": graph})
+
+
+def _only(seen: Seen, kept: BoolArray) -> Seen:
+    columns = [field.name for field in fields(Seen) if field.name != "names"]
+    return replace(seen, **{name: getattr(seen, name)[kept] for name in columns})
+
+
+def gross_error_facts(evidence: Evidence) -> Iterator[Fact]:
+    """How many of each robot's sightings are gross errors, and what that means."""
+    for robot in evidence.robots:
+        found = find_gross_errors(robot.seen, evidence.kernel)
+        number, harmless, n = int(found.gross.sum()), int(found.harmless.sum()), len(found.gross)
+        if not number:
+            continue
+        text = f"{robot.name}: {100 * number / n:.2g} % of its {n} sightings are gross errors"
+        if harmless == number:
+            text += ", each by itself: they hardly count"
+        elif harmless:
+            text += f": {harmless} by themselves, which hardly count, {number - harmless} together"
+        yield Fact(robot.name, number / n, text)
