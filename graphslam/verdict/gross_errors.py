@@ -27,6 +27,8 @@ MOST = 0.1
 #: share of a stretch of sightings, or of a landmark's, that the kernel cannot be trusted with, and
 #: gross errors that are too few to say so
 MAJORITY, LEAST = 0.4, 6
+#: gross errors are of one place that scatter at most so much more than the right ones
+LOOSER = 2.0
 #: sightings in a stretch, and how likely any of all stretches may look like that by chance
 STRETCHES = (5, 10, 20, 50, 100, 200)
 CHANCE = 0.01
@@ -57,7 +59,7 @@ def find_gross_errors(seen: Seen, kernel: RobustConfig) -> GrossErrors:
     weigh = WEIGHTS[kernel.kernel]
     d2, dof = seen.d2, seen.z.shape[1]
     # points without names are gated before, those in the map again are for `vanished_points`
-    nameless = np.array([not name for name in seen.names])[seen.targets] & seen.stands
+    nameless = np.array([not name for name in seen.names], dtype=bool)[seen.targets] & seen.stands
     gross = (d2 > FAR) & ~nameless
     far = np.sqrt(dof * d2[gross]).tolist()
     gross[gross] = [weigh(d, kernel.scale) < WEIGHT for d in far]
@@ -95,11 +97,16 @@ def _of_doubted_targets(seen: Seen, gross: BoolArray) -> BoolArray:
 
 
 def _at_another_place(wrong: Array, right: Array) -> bool:
-    """Whether places (m, 2) agree with each other, but not with those (n, 2) that are right."""
-    place = np.median(wrong, axis=0)
-    spread = float(np.median(np.hypot(*(wrong - place).T)))
-    away = float(np.hypot(*(place - np.median(right, axis=0))))
-    return away > max(MOVED_M, APART * spread)
+    """Whether places (m, 2) agree with each other as those (n, 2) that are right, but elsewhere."""
+    places = [np.median(at, axis=0) for at in (wrong, right)]
+    spreads = [
+        float(np.median(np.hypot(*(at - place).T)))
+        for at, place in zip((wrong, right), places, strict=True)
+    ]
+    away = float(np.hypot(*(places[0] - places[1])))
+    return spreads[0] < max(MOVED_M, LOOSER * spreads[1]) and away > max(
+        MOVED_M, APART * spreads[0]
+    )
 
 
 def without_harmless(evidence: Evidence) -> Evidence:
@@ -137,6 +144,8 @@ def gross_error_facts(evidence: Evidence) -> Iterator[Fact]:
         text = f"{robot.name}: {100 * number / n:.2g} % of its {n} sightings are gross errors"
         if harmless == number:
             text += ", each by itself: they hardly count"
-        elif harmless:
-            text += f": {harmless} by themselves, which hardly count, {number - harmless} together"
+        elif number > MOST * n:
+            text += ", too many to be harmless"
+        else:
+            text += f", {number - harmless} of {number} not by themselves"
         yield Fact(robot.name, number / n, text)
