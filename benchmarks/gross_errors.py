@@ -13,11 +13,11 @@ bursts       for 5 s of every minute all sightings are outliers
 shifted      for 5 s of every minute all ranges are 1 m too long
 
 Errors and NEES per degree of freedom (with its largest) are to be compared with the row "none".
-"wrong landmarks": over 0.3 m from the point of their name, or without a name from all points. An *alarm* is a verdict that is not good;
-it is *false* if the error is at most 1.5 times that without the fault, the NEES at most 2, and no
-landmark wrong. *Silent* is a good verdict with 3 times that error and a NEES over 4, or with a
-named landmark that is wrong. "told" is the share of sightings that the verdict calls gross errors,
-"true" that which is changed.
+"wrong landmarks": over 0.3 m from the point of their name, or without a name from all points. An
+*alarm* is a verdict that is not good; it is *false* if the error is at most 1.5 times that without
+the fault, the NEES at most 2, and no landmark wrong. *Silent* is a good verdict with 3 times that
+error and a NEES over 4, or with a named landmark that is wrong. "told" is the share of sightings
+that the verdict calls gross errors, "true" that which is changed.
 
 Run: python benchmarks/gross_errors.py [KIND ...] [--seeds 10] [--seconds 150] [--only TEXT]
 exit code 1 if any is silent, or over 1 in 20 with up to 5 % of outliers or names is a false alarm.

@@ -26,6 +26,7 @@ SMALL: dict[str, list[str]] = {
     "frontend_speed.py": ["--scans", "20"],
     "frontend_table.py": ["--seeds", "1", "--no-runs"],
     "full_information.py": ["given", "--seeds", "1", "--seconds", "20"],
+    "gross_errors.py": ["named", "--seeds", "1", "--seconds", "30", "--only", "outliers 2 %"],
     "growth.py": ["--landmarks", "100", "200", "--rounds"],
     "healthy_logs.py": ["FOLDER", "--seeds", "1", "--only", "lab"],
     "horizon.py": ["lab"],

@@ -141,6 +141,8 @@ def smoothed(result: Result, directory: Path) -> None:
     _unobservable(console, summary["calibration"])
     for warning in summary["warnings"]:
         console.print(f"warning: {warning}")
+    for fact in summary["verdict"].get("facts", ()):
+        console.print(f"note: {fact['text']}")
     for reason in summary["verdict"]["reasons"]:
         console.print(f"{reason['level']}: {reason['text']}")
     console.print(f"verdict: {summary['verdict']['verdict']}")

@@ -1,6 +1,6 @@
 """Gross errors of sightings that a robust kernel is there for, and those that it cannot tell apart.
 
-A kernel whose weights fall faster than residuals grow follows the majority: a few false detections,
+A kernel whose influence decreases follows the majority: a few false detections,
 each by itself, pull less the further off they are. It does not help where most of what is seen for
 a moment, or of one landmark, is wrong, nor does it say that a landmark was moved. The first are
 facts about a sensor, the others reasons to doubt the result.
@@ -20,8 +20,9 @@ from graphslam.verdict.doubts import MOVED_M
 from graphslam.verdict.evidence import Evidence, Seen
 from graphslam.verdict.moved_points import APART
 
-#: squared distance per degree of freedom, and weight by the kernel, of a gross error
-FAR, WEIGHT = 25.0, 0.1
+#: squared distance per degree of freedom of a gross error, and how many sigmas it may pull: no
+#: more than a right sighting does
+FAR, PULL = 25.0, 1.0
 #: of a robot's sightings: with a larger share of gross errors none is taken for harmless
 MOST = 0.1
 #: share of a stretch of sightings, or of a landmark's, that the kernel cannot be trusted with, and
@@ -59,10 +60,10 @@ def find_gross_errors(seen: Seen, kernel: RobustConfig) -> GrossErrors:
     weigh = WEIGHTS[kernel.kernel]
     d2, dof = seen.d2, seen.z.shape[1]
     # points without names are gated before, those in the map again are for `vanished_points`
-    nameless = np.array([not name for name in seen.names], dtype=bool)[seen.targets] & seen.stands
-    gross = (d2 > FAR) & ~nameless
+    named = np.isin(seen.targets, [k for k, name in enumerate(seen.names) if name])
+    gross = (d2 > FAR) & (named | ~seen.stands)
     far = np.sqrt(dof * d2[gross]).tolist()
-    gross[gross] = [weigh(d, kernel.scale) < WEIGHT for d in far]
+    gross[gross] = [d * weigh(d, kernel.scale) < PULL for d in far]
     if not gross.any() or gross.mean() > MOST:
         return GrossErrors(gross, np.zeros_like(gross))
     return GrossErrors(gross, gross & ~_in_stretch(gross) & ~_of_doubted_targets(seen, gross))
