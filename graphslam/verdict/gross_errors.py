@@ -16,7 +16,7 @@ from graphslam.core.arrays import BoolArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, polar_points, transform_each
 from graphslam.estimation.m_estimators import WEIGHTS
-from graphslam.verdict.doubts import MOVED_M
+from graphslam.verdict.doubts import MOVED_M, Reason
 from graphslam.verdict.evidence import Evidence, Seen
 from graphslam.verdict.moved_points import APART
 
@@ -28,6 +28,8 @@ MOST = 0.1
 #: share of a stretch of sightings, or of a landmark's, that the kernel cannot be trusted with, and
 #: gross errors that are too few to say so
 MAJORITY, LEAST = 0.4, 6
+#: gross errors of a landmark that say that it is elsewhere
+FEW = 2
 #: gross errors are of one place that scatter at most so much more than the right ones
 LOOSER = 2.0
 #: sightings in a stretch, and how likely any of all stretches may look like that by chance
@@ -89,7 +91,7 @@ def _of_doubted_targets(seen: Seen, gross: BoolArray) -> BoolArray:
     """Which (n,) are of something that is mostly elsewhere, or at one other place now and then."""
     count = np.bincount(seen.targets)
     wrong = np.bincount(seen.targets[gross], minlength=len(count))
-    doubted = (wrong >= LEAST) & (wrong > MAJORITY * count)
+    doubted = (wrong >= FEW) & (wrong > MAJORITY * count)
     at = transform_each(seen.poses, polar_points(seen.z[:, 1], seen.z[:, 0]))
     for target in np.flatnonzero((wrong >= LEAST) & ~doubted).tolist():
         own = seen.targets == target
@@ -108,6 +110,24 @@ def _at_another_place(wrong: Array, right: Array) -> bool:
     return spreads[0] < max(MOVED_M, LOOSER * spreads[1]) and away > max(
         MOVED_M, APART * spreads[0]
     )
+
+
+def misplaced_doubts(evidence: Evidence) -> Iterator[Reason]:
+    """Named landmarks where they are by few of their sightings: where they are is not known."""
+    for robot in evidence.robots:
+        seen = robot.seen
+        gross = find_gross_errors(seen, evidence.kernel).gross
+        count = np.bincount(seen.targets, minlength=len(seen.names))
+        wrong = np.bincount(seen.targets[gross], minlength=len(count))
+        lost = np.flatnonzero((wrong >= FEW) & (wrong > 0.5 * count)).tolist()
+        names = sorted(seen.names[k] for k in lost if k < len(seen.names) and seen.names[k])
+        if names:
+            text = (
+                f"{robot.name}: most of its sightings of {', '.join(names[:5])}"
+                f"{' and others' if len(names) > 5 else ''} are nowhere near where the map has it: "
+                "wrong names?"
+            )
+            yield Reason("doubtful", "misplaced", robot.name, text)
 
 
 def without_harmless(evidence: Evidence) -> Evidence:

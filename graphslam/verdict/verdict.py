@@ -17,7 +17,11 @@ from graphslam.estimation.log_noise import MOTION
 from graphslam.logs.time_order import TOO_LATE
 from graphslam.verdict.doubts import Reason, seconds
 from graphslam.verdict.evidence import Evidence
-from graphslam.verdict.gross_errors import gross_error_facts, without_harmless
+from graphslam.verdict.gross_errors import (
+    gross_error_facts,
+    misplaced_doubts,
+    without_harmless,
+)
 from graphslam.verdict.moved_points import moved_doubts
 from graphslam.verdict.odometry_doubts import odometry_doubts
 from graphslam.verdict.regular_landmarks import regular_landmark_doubts
@@ -265,6 +269,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "regular landmarks": regular_landmark_doubts,
     "points": vanished_doubts,
     "moved": moved_doubts,
+    "misplaced": misplaced_doubts,
     "noise": _noise,
     "residuals": _misfit,
     "closures": _closures,

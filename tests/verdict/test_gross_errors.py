@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_verdict import SUMMARY, evidence
+from test_verdict import SUMMARY, evidence, only
 
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import between
@@ -84,3 +84,19 @@ def test_a_healthy_run_has_no_facts():
 def test_facts_stay_where_the_truth_is_known():
     verdict = with_errors(outliers(0.05))
     assert with_truth(verdict, None)["facts"] == verdict["facts"]
+
+
+def test_a_landmark_that_is_mostly_seen_elsewhere_is_doubted():
+    """Two of three sightings, as of one that is only seen under false names: hardly any residual."""
+
+    def seen(own):
+        kept = np.ones(len(own.z), dtype=bool)
+        kept[np.flatnonzero(own.targets == 3)[3:]] = False
+        own = only(own, kept)
+        d2 = np.ones(len(own.z))
+        d2[np.flatnonzero(own.targets == 3)[:2]] = FAR_D2
+        return replace(own, d2=d2)
+
+    verdict = judge(evidence(seen=seen))
+    (reason,) = verdict["reasons"]
+    assert "p3" in reason["text"]
