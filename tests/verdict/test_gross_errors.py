@@ -87,7 +87,7 @@ def test_facts_stay_where_the_truth_is_known():
 
 
 def test_a_landmark_that_is_mostly_seen_elsewhere_is_doubted():
-    """Two of three sightings, as of one that is only seen under false names: hardly any residual."""
+    """Two of three sightings, as of one only seen under false names: hardly any residual."""
 
     def seen(own):
         kept = np.ones(len(own.z), dtype=bool)
