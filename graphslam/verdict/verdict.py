@@ -17,6 +17,7 @@ from graphslam.estimation.log_noise import MOTION
 from graphslam.logs.time_order import TOO_LATE
 from graphslam.verdict.doubts import Reason, seconds
 from graphslam.verdict.evidence import Evidence
+from graphslam.verdict.excursions import excursion_doubts
 from graphslam.verdict.gross_errors import (
     gross_error_facts,
     misplaced_doubts,
@@ -264,6 +265,7 @@ CHECKS: dict[str, Callable[[Evidence], Iterable[Reason]]] = {
     "odometry": odometry_doubts,
     "scans": scan_doubts,
     "sightings": sighting_doubts,
+    "excursions": excursion_doubts,
     "turned sensors": turned_sensor_doubts,
     "sensor errors": large_error_doubts,
     "regular landmarks": regular_landmark_doubts,
