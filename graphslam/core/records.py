@@ -95,7 +95,8 @@ class Sighting(Message):
     direction being the heading of the target relative to the sensor. ``cov`` is (2, 2) or
     (3, 3). ``identity`` is None when unknown. ``seen_robot`` names a robot; where it is None,
     ``may_be`` says what is seen: a ``landmark``, some ``robot``, or ``either``. Sightings of one
-    robot at one stamp form one image: they exclude each other.
+    robot at one stamp form one image: they exclude each other. ``stated``: whether ``cov`` is what
+    its sensor says; else it is a beginning from which that is measured.
     """
 
     z: Array
@@ -104,6 +105,7 @@ class Sighting(Message):
     seen_robot: str | None
     mount: Array
     may_be: str = "landmark"
+    stated: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,6 +28,7 @@ class LogNoise:
     included, that the log shows, and likewise (3,) of motions whose covariances are stated.
     ``lines``: robot -> factors (2,) on the stated variances of normal offsets and directions of
     its lines, by which covariances are computed. ``of_whole_log``: found in all of it.
+    ``unstated``: sources that state no noise; their factors are on what they began with.
     """
 
     sightings: Mapping[Source, ObservationNoise] = field(default_factory=dict)
@@ -35,6 +36,7 @@ class LogNoise:
     measured: Mapping[Source, Array] = field(default_factory=dict)
     lines: Mapping[str, Array] = field(default_factory=dict)
     of_whole_log: bool = False
+    unstated: frozenset[Source] = frozenset()
 
     def motion_scales(self) -> dict[str, Array]:
         """Robot -> factor (3,) on the sigmas of its motions: the stated noise is never reduced."""
@@ -64,6 +66,8 @@ class LogNoise:
             noise = self.sightings.get((robot, model))
             if noise is not None:
                 entry |= {"white": noise.white.tolist(), "shared": noise.shared.tolist()}
+            if (robot, model) in self.unstated:
+                entry["stated"] = False
             out[f"{robot} {model}"] = entry
         for robot, factors in self.lines.items():
             names = ("normal offsets", "directions")

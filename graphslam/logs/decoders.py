@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from graphslam.core import records
-from graphslam.core.geometry import Array, are_positive
+from graphslam.core.geometry import Array
 from graphslam.core.record import replace
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
@@ -28,6 +28,11 @@ from graphslam.logs.record_checks import (
     check_sighting,
     check_wheels,
     checked_covariance,
+)
+from graphslam.logs.sighting_covariances import (
+    common_covariance,
+    polar_covariances,
+    states_none,
 )
 
 #: decimals of a heading, rad, that are taken from a quaternion. Written again, it differs by 1e-16:
@@ -232,7 +237,8 @@ def sightings(
     numbers, of_what = rows
     measured, covs = numbers["z"].astype(float), numbers["covariance"].astype(float)
     sizes = np.where(np.isnan(measured[:, 2]), 2, 3).tolist()
-    plain, usable = _polar_covariances(measured, covs)
+    plain, usable = polar_covariances(measured, covs)
+    unknown = states_none(covs).tolist()
     mount = topic.mounts.get(numbers["frame"][0].decode().lstrip("/"), _NO_MOUNT)
     found: list[records.Sighting | str] = []
     for i, stamp in enumerate(schemas.stamps_ns(numbers).tolist()):
@@ -241,41 +247,23 @@ def sightings(
             cov = plain[i]
         else:
             try:
-                cov = checked_covariance("sighting", covs[i], sizes[i])
                 check_sighting(z)
+                cov = (
+                    common_covariance(z)
+                    if unknown[i]
+                    else checked_covariance("sighting", covs[i], sizes[i])
+                )
             except UnusableMessageError as reason:
                 found.append(str(reason))
                 continue
         may_be = _UNNAMED.get(robot)
         names = (identity or None, topic.named(robot) or None) if may_be is None else (None, None)
-        seen = records.Sighting(topic.robot, stamp, stamp, z, cov, *names, mount)
-        found.append(seen if may_be is None else replace(seen, may_be=may_be))
+        seen = records.Sighting(
+            topic.robot, stamp, stamp, z, cov, *names, mount,
+            may_be or "landmark", not unknown[i],
+        )  # fmt: skip
+        found.append(seen)
     return found
-
-
-def _polar_covariances(measured: Array, covs: Array) -> tuple[Sequence[Array], list[bool]]:
-    """Covariances (2, 2) of bearings and ranges, and which of the sightings can be used for sure.
-
-    The conditions of `checked_covariance` and `check_sighting`, of all at once: most sightings
-    hold them. Those two say what is wrong with the others, and judge those with a direction.
-    ``measured`` (n, 3): bearing, range and maybe direction; ``covs`` (n, 9): what they state.
-    """
-    full = covs.reshape(-1, 3, 3)[:, :2, :2]
-    full = (full + full.mT) / 2
-    variances = np.diagonal(full, axis1=1, axis2=2)
-    usable = (
-        np.isnan(measured[:, 2])
-        & np.isfinite(measured[:, 0])
-        & (measured[:, 1] > 0)
-        & (measured[:, 1] <= limits.MAX_SIGHTING_M)
-        & are_positive(full)
-        & (variances.min(axis=1) >= limits.MIN_VARIANCE)
-        & (variances.max(axis=1) <= limits.MAX_SIGHTING_VARIANCE)
-    )
-    full.flags.writeable = False
-    # sensors mostly state the same one, so messages share it
-    shared = [full[0]] * len(full) if (full == full[0]).all() else list(full)
-    return shared, usable.tolist()
 
 
 def odometry_increment(message: Any, topic: TopicContext) -> records.OdometryIncrement:

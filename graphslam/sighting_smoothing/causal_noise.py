@@ -27,7 +27,7 @@ class NoiseSoFar:
     """The noise of the sightings of a log, from its first part.
 
     ``groups``: all sightings of the log, by that noise once it is known. ``known``: the sources
-    whose errors are shared; n sightings of one target in a step count as one for the others, and
+    whose errors are shared, or that state no noise; n sightings of one target in a step count as one for the others, and
     have the noise that is stated.
     """
 
@@ -58,7 +58,9 @@ class NoiseSoFar:
         return not self._done and self._first <= taken < len(self._steps)
 
     def measure(self, taken: int, estimate: Estimate, tracks: Mapping[str, Track]) -> bool:
-        """Measure the noise; whether errors are shared, so that the ``groups`` are others.
+        """Measure the noise; whether it is used, so that the ``groups`` are others.
+
+        It is where errors are shared, or noise is not stated.
 
         Args:
             taken: number of the steps so far.
@@ -79,7 +81,8 @@ class NoiseSoFar:
         finally:
             for name, (calibration, prior) in before.items():
                 own[name].calibration, own[name].prior = calibration, prior
-        self.known = frozenset(s for s, found in noise.sightings.items() if found.shared.any())
+        shared = frozenset(s for s, found in noise.sightings.items() if found.shared.any())
+        self.known = shared | noise.unstated
         self.groups = [
             _with_noise(group, noise) if _source(group) in self.known else group
             for group in self.groups

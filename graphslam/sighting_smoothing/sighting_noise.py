@@ -80,8 +80,9 @@ def estimate_noise(
     tracks = {name: tracks[name] for name in state_times(sample)}
     estimate = at_states(estimate, sample, tracks)
     before = {name: track.config for name, track in tracks.items()}
+    unstated = unstated_sources(sample, sources)
     try:
-        noise = _estimated(sample, estimate, tracks, config, rounds)
+        noise = _estimated(sample, estimate, tracks, config, rounds, unstated)
         if len(chosen) > len(steps):  # with the starts apart
             noise = replace(noise, of_whole_log=True)
         if noise.of_whole_log or not has_state_at_every_sighting(noise.sightings):
@@ -91,6 +92,16 @@ def estimate_noise(
     finally:
         for name, track in tracks.items():
             track.config = before[name]
+
+
+def unstated_sources(steps: Sequence[Step], sources: Sequence[Sighting]) -> frozenset[Source]:
+    """Those of whose sightings in ``steps`` none states its noise, see `Sighting.stated`.
+
+    ``sources``: `Association.source` is an index into them.
+    """
+    seen = [a for step in steps for a in step.associations if a.source is not None]
+    stated = {(a.robot, a.model) for a in seen if sources[a.source].stated}
+    return frozenset((a.robot, a.model) for a in seen) - stated
 
 
 def stretch(steps: Sequence[Step]) -> tuple[Step, ...]:
@@ -124,6 +135,7 @@ def _estimated(
     tracks: Mapping[str, Track],
     config: Config,
     rounds: int,
+    unstated: frozenset[Source],
 ) -> LogNoise:
     """`estimate_noise` of all ``steps``; changes the tracks."""
     priors = {name: track.prior for name, track in tracks.items()}
@@ -168,8 +180,12 @@ def _estimated(
         tracks[name].config = with_fit_uncertainty(tracks[name].config, fit.log_sigma)
     for source, found in noise.items():
         measured[source] = found.white + found.shared
-    final = {source: _cautious(found, config) for source, found in noise.items()}
-    return LogNoise(final, {name: track.config for name, track in tracks.items()}, measured)
+    final = {
+        source: _own_kernel(found, config) if source in unstated else _cautious(found, config)
+        for source, found in noise.items()
+    }
+    odometry = {name: track.config for name, track in tracks.items()}
+    return LogNoise(final, odometry, measured, unstated=unstated)
 
 
 def _sighting_noise(
@@ -209,6 +225,11 @@ def _is_measured(posterior: Posterior, source: Source) -> Array:
     z, cov = posterior.builder.polar[source]
     sigmas = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     return np.asarray(np.median(sigmas, axis=0) < [UNKNOWN_BEARING_RAD, np.median(z[:, 1])])
+
+
+def _own_kernel(found: ObservationNoise, config: Config) -> ObservationNoise:
+    """Noise as it was found; the width of a kernel is known where it is white."""
+    return replace(found, kernel_scale=config.robust.scale) if found.shared.any() else found
 
 
 def _cautious(found: ObservationNoise, config: Config) -> ObservationNoise:

@@ -1,6 +1,7 @@
 """The keys of summary.json, and the warnings about a run that went through."""
 
 import hashlib
+import math
 import platform
 from collections import Counter
 from collections.abc import Mapping
@@ -20,6 +21,7 @@ from graphslam.core.suggestions import start_option
 from graphslam.estimation.clock_calibration import ClockEstimate
 from graphslam.estimation.motion_noise import understated_noise
 from graphslam.logs import LogSet
+from graphslam.logs.sighting_covariances import BEARING_RAD, RANGE_M, RANGE_SHARE
 from graphslam.odometry.several_lasers import SeveralLasersTrack
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.pipeline.robot_settings import robot_settings
@@ -232,12 +234,26 @@ def noise_warnings(noise: Mapping[str, Any]) -> list[str]:
     for source, found in noise.items():
         robot, _, model = source.rpartition(" ")
         of = _SEEN.get(model, "")
+        if not found.get("stated", True):
+            lines.append(_unstated_noise(robot, of, found["measured"]))
+            continue
         for name, factor in found.get("measured", {}).items():
             if not 1 / CONTRADICTED < factor < CONTRADICTED:
                 digits = _two_digits(max(factor, 1 / factor))
                 more = f"{digits} times" if factor > 1 else f"1/{digits} of"
                 lines.append(f"{robot}: the variance of {name}{of} is {more} what is stated")
     return lines
+
+
+def _unstated_noise(robot: str, of: str, factors: Mapping[str, float]) -> str:
+    """What the log says of sightings that state no noise."""
+    bearing, distance = (math.sqrt(factors[name]) for name in ("bearings", "ranges"))
+    by = "the log" if (bearing, distance) != (1.0, 1.0) else "default, as there are few"
+    return (
+        f"{robot}: its sightings{of} state no covariances; by {by}, sigmas are "
+        f"{math.degrees(bearing * BEARING_RAD):.2g}° of bearings, and of ranges "
+        f"{distance * RANGE_M:.2g} m and {100 * distance * RANGE_SHARE:.2g} % of the range"
+    )
 
 
 def _sessions(pipeline: LogPass) -> dict[str, Any]:

@@ -124,7 +124,8 @@ def _noise(evidence: Evidence) -> Iterable[Reason]:
             other = others.get(robot, "sightings") if model == MOTION else "sightings"
             text = (
                 f"{robot}: its {other} and its odometry contradict each other: errors of {worst} "
-                f"are {measured[worst] ** 0.5:.0f} times what is stated"
+                f"are {measured[worst] ** 0.5:.0f} times what "
+                f"{'is stated' if found.get('stated', True) else 'sensors commonly have'}"
             )
             yield Reason(level, "noise", robot, text)
 
