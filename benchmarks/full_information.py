@@ -8,6 +8,7 @@ aligned; final poses; means over seeds, the ratio of the means, and the spread o
 
 given    increments that state their covariances
 poses    odometry as poses: its noise is unknown
+unstated odometry as poses, sightings without covariances: all noise is unknown
 late     sightings stamped 50 ms late, increments; the batch knows by how much
 unnamed  identities left out, increments; landmarks beside
 sparse   one image per second
@@ -55,6 +56,7 @@ POINTS, VISIBLE = 17, 5
 BARS = {
     "given": (1.1, (0.8, 1.25)),
     "poses": (1.25, (0.0, 1.5)),
+    "unstated": (1.25, (0.0, 1.5)),
     "late": (1.1, (0.8, 1.25)),
     "unnamed": (1.3, (0.0, np.inf)),
     "sparse": (1.1, (0.75, 1.25)),
@@ -157,7 +159,7 @@ def write(path: Path, log: Log, kind: str, fault: str = "") -> None:
     with LogWriter(path) as out:
         for k, stamp in enumerate(stamps):
             for robot, own in log.drives.items():
-                if kind == "poses":
+                if kind in ("poses", "unstated"):
                     if k:
                         poses[robot] = compose(poses[robot], exp(own.twists[k - 1]))
                     out.odometry(robot, stamp, poses[robot])
@@ -169,6 +171,8 @@ def write(path: Path, log: Log, kind: str, fault: str = "") -> None:
                 other = name if name in log.drives else None
                 identity = None if other or kind == "unnamed" else name
                 cov = np.diag(np.append(SIGHTING, DIRECTION)[: len(z)] ** 2)
+                if kind == "unstated":
+                    cov = np.zeros_like(cov)
                 z = z + np.array([turned, scaled * z[1], turned])[: len(z)]
                 z[0] = wrap(z[0])
                 out.sighting(robot, stamp, z, cov, identity=identity, seen_robot=other)

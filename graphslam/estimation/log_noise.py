@@ -12,6 +12,7 @@ from graphslam.core.config import OdometryConfig, RobustConfig
 from graphslam.core.geometry import Array
 from graphslam.core.motion_models import RATES
 from graphslam.core.records import Association, Step
+from graphslam.estimation.range_noise import RangeNoise
 from graphslam.estimation.recorded_graph import SHARED_NS, ObservationNoise, Source
 from graphslam.estimation.sandwich_covariance import weighing_variance
 
@@ -28,7 +29,9 @@ class LogNoise:
     included, that the log shows, and likewise (3,) of motions whose covariances are stated.
     ``lines``: robot -> factors (2,) on the stated variances of normal offsets and directions of
     its lines, by which covariances are computed. ``of_whole_log``: found in all of it.
-    ``unstated``: sources that state no noise; their factors are on what they began with.
+    ``unstated``: source that states no noise -> the sigmas (3,) that the log shows: of bearings,
+    rad, of ranges, m, and as a share of these; its factors are on what it began with. ``ranges``:
+    how the noise of ranges grows, where that is likelier than what it began with.
     """
 
     sightings: Mapping[Source, ObservationNoise] = field(default_factory=dict)
@@ -36,7 +39,8 @@ class LogNoise:
     measured: Mapping[Source, Array] = field(default_factory=dict)
     lines: Mapping[str, Array] = field(default_factory=dict)
     of_whole_log: bool = False
-    unstated: frozenset[Source] = frozenset()
+    unstated: Mapping[Source, Array] = field(default_factory=dict)
+    ranges: Mapping[Source, RangeNoise] = field(default_factory=dict)
 
     def motion_scales(self) -> dict[str, Array]:
         """Robot -> factor (3,) on the sigmas of its motions: the stated noise is never reduced."""
@@ -66,8 +70,10 @@ class LogNoise:
             noise = self.sightings.get((robot, model))
             if noise is not None:
                 entry |= {"white": noise.white.tolist(), "shared": noise.shared.tolist()}
-            if (robot, model) in self.unstated:
-                entry["stated"] = False
+            sigmas = self.unstated.get((robot, model))
+            if sigmas is not None:
+                names = ("bearing_rad", "range_m", "range_share")
+                entry |= {"stated": False, "sigmas": dict(zip(names, sigmas.tolist(), strict=True))}
             out[f"{robot} {model}"] = entry
         for robot, factors in self.lines.items():
             names = ("normal offsets", "directions")

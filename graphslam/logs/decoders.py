@@ -14,7 +14,6 @@ import numpy as np
 
 from graphslam.core import records
 from graphslam.core.geometry import Array
-from graphslam.core.record import replace
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
@@ -238,7 +237,7 @@ def sightings(
     measured, covs = numbers["z"].astype(float), numbers["covariance"].astype(float)
     sizes = np.where(np.isnan(measured[:, 2]), 2, 3).tolist()
     plain, usable = polar_covariances(measured, covs)
-    unknown = states_none(covs).tolist()
+    unknown = states_none(measured, covs).tolist()
     mount = topic.mounts.get(numbers["frame"][0].decode().lstrip("/"), _NO_MOUNT)
     found: list[records.Sighting | str] = []
     for i, stamp in enumerate(schemas.stamps_ns(numbers).tolist()):

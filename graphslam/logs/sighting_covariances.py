@@ -19,9 +19,16 @@ BEARING_RAD, DIRECTION_RAD = 0.03, 0.1
 RANGE_M, RANGE_SHARE = 0.03, 0.03
 
 
-def states_none(covs: Array) -> BoolArray:
-    """Which of covariances (n, 9), as in messages, are not filled in: all zero, or all NaN."""
-    return np.asarray((covs == 0.0).all(axis=1) | np.isnan(covs).all(axis=1))
+def states_none(measured: Array, covs: Array) -> BoolArray:
+    """Which of covariances (n, 9), as in messages, are not filled in: all zero, or all NaN.
+
+    ``measured`` (n, 3): only what is measured counts; a direction that is not is NaN.
+    """
+    is_point = np.isnan(measured[:, 2])
+    rest = np.isin(np.arange(9), (0, 1, 3, 4), invert=True)
+    ignored = is_point[:, None] & rest
+    zero, nan = (covs == 0.0) | ignored, np.isnan(covs) | ignored
+    return np.asarray(zero.all(axis=1) | nan.all(axis=1))
 
 
 def common_covariance(z: Array) -> Array:

@@ -27,8 +27,8 @@ class NoiseSoFar:
     """The noise of the sightings of a log, from its first part.
 
     ``groups``: all sightings of the log, by that noise once it is known. ``known``: the sources
-    whose errors are shared, or that state no noise; n sightings of one target in a step count as one for the others, and
-    have the noise that is stated.
+    whose errors are shared, or that state no noise; n sightings of one target in a step count as
+    one for the others, and have the noise that is stated.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class NoiseSoFar:
             for name, (calibration, prior) in before.items():
                 own[name].calibration, own[name].prior = calibration, prior
         shared = frozenset(s for s, found in noise.sightings.items() if found.shared.any())
-        self.known = shared | noise.unstated
+        self.known = shared | noise.unstated.keys()
         self.groups = [
             _with_noise(group, noise) if _source(group) in self.known else group
             for group in self.groups

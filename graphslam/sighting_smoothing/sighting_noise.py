@@ -6,7 +6,7 @@ noise that is new in every sighting, and errors that sightings of one target sha
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -28,12 +28,20 @@ from graphslam.estimation.recorded_graph import ObservationNoise, Source
 from graphslam.estimation.residual_distribution import fit_distribution, shared_variance
 from graphslam.odometry.noise_estimation import with_fit_uncertainty, without_floors
 from graphslam.odometry.preintegration import Track
+from graphslam.pipeline.log_pass import LogPass
 from graphslam.sighting_smoothing.sensor_latency import hold_insignificant_latency
 from graphslam.sighting_smoothing.sighting_states import (
     at_states,
     state_times,
     steps_at_sightings,
     with_motions,
+)
+from graphslam.sighting_smoothing.unstated_noise import (
+    MIN_MEASUREMENTS,
+    likelier_ranges,
+    sigmas_of,
+    unstated_sources,
+    with_range_noise,
 )
 
 #: sightings in the stretch, about
@@ -49,8 +57,6 @@ CONVERGED_ERROR = 5e-4
 MIN_VARIANCE = 1e-4
 #: rad: a bearing that is stated to be less certain was not measured
 UNKNOWN_BEARING_RAD = 1.0
-#: sightings without which nothing is said about a source
-MIN_MEASUREMENTS = 100
 
 
 def estimate_noise(
@@ -82,7 +88,12 @@ def estimate_noise(
     before = {name: track.config for name, track in tracks.items()}
     unstated = unstated_sources(sample, sources)
     try:
-        noise = _estimated(sample, estimate, tracks, config, rounds, unstated)
+        noise, last = _estimated(sample, estimate, tracks, config, rounds, unstated)
+        sigmas = {
+            source: sigmas_of(numbers, sources, noise.measured[source])
+            for source, numbers in unstated.items()
+        }
+        noise = replace(noise, unstated=sigmas, ranges=likelier_ranges(last, sources, unstated))
         if len(chosen) > len(steps):  # with the starts apart
             noise = replace(noise, of_whole_log=True)
         if noise.of_whole_log or not has_state_at_every_sighting(noise.sightings):
@@ -94,14 +105,20 @@ def estimate_noise(
             track.config = before[name]
 
 
-def unstated_sources(steps: Sequence[Step], sources: Sequence[Sighting]) -> frozenset[Source]:
-    """Those of whose sightings in ``steps`` none states its noise, see `Sighting.stated`.
+def noise_of_pass(one: LogPass, estimate: Estimate) -> LogNoise:
+    """`estimate_noise` of a pass; where none is stated, its sightings get what is likelier.
 
-    ``sources``: `Association.source` is an index into them.
+    Raises:
+        EstimationError: the estimate is indeterminate.
     """
-    seen = [a for step in steps for a in step.associations if a.source is not None]
-    stated = {(a.robot, a.model) for a in seen if sources[a.source].stated}
-    return frozenset((a.robot, a.model) for a in seen) - stated
+    tracks = {name: run.track for name, run in one.started.items()}
+    noise = estimate_noise(one.steps, one.sources, estimate, tracks, one.config)
+    if noise.ranges:
+        unstated = unstated_sources(one.steps, one.sources)
+        one.sources = with_range_noise(one.sources, unstated, noise.ranges)
+        noise = estimate_noise(one.steps, one.sources, estimate, tracks, one.config)
+    one.noise = noise.to_summary()
+    return noise
 
 
 def stretch(steps: Sequence[Step]) -> tuple[Step, ...]:
@@ -135,9 +152,9 @@ def _estimated(
     tracks: Mapping[str, Track],
     config: Config,
     rounds: int,
-    unstated: frozenset[Source],
-) -> LogNoise:
-    """`estimate_noise` of all ``steps``; changes the tracks."""
+    unstated: Collection[Source],
+) -> tuple[LogNoise, Posterior]:
+    """`estimate_noise` of all ``steps``, and their last solution; changes the tracks."""
     priors = {name: track.prior for name, track in tracks.items()}
     one = np.ones(2)
     sources = {(a.robot, a.model) for s in steps for a in s.associations if len(a.z) == 2}
@@ -185,7 +202,7 @@ def _estimated(
         for source, found in noise.items()
     }
     odometry = {name: track.config for name, track in tracks.items()}
-    return LogNoise(final, odometry, measured, unstated=unstated)
+    return LogNoise(final, odometry, measured), posterior
 
 
 def _sighting_noise(

@@ -32,7 +32,7 @@ from graphslam.sighting_smoothing.rough_solution import (
     with_landmarks,
 )
 from graphslam.sighting_smoothing.sensor_calibration import solved_with_sensors
-from graphslam.sighting_smoothing.sighting_noise import estimate_noise
+from graphslam.sighting_smoothing.sighting_noise import noise_of_pass
 from graphslam.sighting_smoothing.sighting_pass import SightingPass
 from graphslam.sighting_smoothing.state_at_every_sighting import FineSolution
 from graphslam.sighting_smoothing.state_per_step import sighting_problem
@@ -117,8 +117,7 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     """
 
     def solve(start: Estimate) -> FineSolution:
-        noise = estimate_noise(one.steps, one.sources, start, one.tracks, one.config)
-        one.noise = noise.to_summary()
+        noise = noise_of_pass(one, start)
         problem, start = sighting_problem(one, start, noise)
         return problem.finish(one, problem.steps, start)
 

@@ -16,7 +16,7 @@ from graphslam.mapping.point_reassociation import PointSightings, is_point, reas
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.sighting_smoothing.misplaced_landmarks import with_landmarks_placed_again
 from graphslam.sighting_smoothing.sensor_calibration import solved_with_sensors
-from graphslam.sighting_smoothing.sighting_noise import estimate_noise
+from graphslam.sighting_smoothing.sighting_noise import noise_of_pass
 from graphslam.sighting_smoothing.state_at_every_sighting import FineSolution, SightingProblem
 from graphslam.sighting_smoothing.state_per_step import SteppedProblem, sighting_problem
 
@@ -37,15 +37,13 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
         EstimationError: the estimate is indeterminate.
     """
     config, landmarks = one.config, one.landmarks
-    tracks = {name: run.track for name, run in one.started.items()}
     if not config.odometry.calibrate:
         return estimate, tuple(one.steps)
     before = len(estimate.landmarks)
     estimate = with_landmarks_placed_again(one.steps, estimate, config.robust)
 
     def solve(start: Estimate) -> FineSolution:
-        noise = estimate_noise(one.steps, one.sources, start, tracks, config)
-        one.noise = noise.to_summary()
+        noise = noise_of_pass(one, start)
         problem, start = sighting_problem(one, start, noise)
         steps, start = _settled_associations(one, problem, start)
         found = problem.finish(one, steps, start)

@@ -21,7 +21,6 @@ from graphslam.core.suggestions import start_option
 from graphslam.estimation.clock_calibration import ClockEstimate
 from graphslam.estimation.motion_noise import understated_noise
 from graphslam.logs import LogSet
-from graphslam.logs.sighting_covariances import BEARING_RAD, RANGE_M, RANGE_SHARE
 from graphslam.odometry.several_lasers import SeveralLasersTrack
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.pipeline.robot_settings import robot_settings
@@ -235,7 +234,7 @@ def noise_warnings(noise: Mapping[str, Any]) -> list[str]:
         robot, _, model = source.rpartition(" ")
         of = _SEEN.get(model, "")
         if not found.get("stated", True):
-            lines.append(_unstated_noise(robot, of, found["measured"]))
+            lines.append(_unstated_noise(robot, of, found["sigmas"]))
             continue
         for name, factor in found.get("measured", {}).items():
             if not 1 / CONTRADICTED < factor < CONTRADICTED:
@@ -245,14 +244,12 @@ def noise_warnings(noise: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _unstated_noise(robot: str, of: str, factors: Mapping[str, float]) -> str:
+def _unstated_noise(robot: str, of: str, sigmas: Mapping[str, float]) -> str:
     """What the log says of sightings that state no noise."""
-    bearing, distance = (math.sqrt(factors[name]) for name in ("bearings", "ranges"))
-    by = "the log" if (bearing, distance) != (1.0, 1.0) else "default, as there are few"
     return (
-        f"{robot}: its sightings{of} state no covariances; by {by}, sigmas are "
-        f"{math.degrees(bearing * BEARING_RAD):.2g}° of bearings, and of ranges "
-        f"{distance * RANGE_M:.2g} m and {100 * distance * RANGE_SHARE:.2g} % of the range"
+        f"{robot}: its sightings{of} state no covariances; sigmas of "
+        f"{math.degrees(sigmas['bearing_rad']):.2g}° of bearings, and of ranges "
+        f"{sigmas['range_m']:.2g} m and {100 * sigmas['range_share']:.2g} % of the range were used"
     )
 
 

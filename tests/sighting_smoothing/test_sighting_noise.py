@@ -9,6 +9,7 @@ import pytest
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import Array, between, compose, exp, wrap
 from graphslam.logs import LogWriter, open_logs
+from graphslam.logs.sighting_covariances import BEARING_RAD, RANGE_M, RANGE_SHARE
 from graphslam.sighting_smoothing import sighting_noise
 from graphslam.slam.smooth import smooth
 
@@ -299,6 +300,68 @@ def test_noise_that_the_log_contradicts_is_named(tmp_path):
         assert len(lines) == 2 and all(words in line for line in lines)
     fine = solved(tmp_path / "fine.mcap", simulate(4), increments=True)
     assert not [w for w in fine.summary["warnings"] if "variance" in w]
+
+
+@pytest.mark.parametrize("unknown", [0.0, np.nan])
+def test_sightings_that_state_no_noise_are_as_good_as_those_that_do(tmp_path, unknown):
+    """Drivers that do not know it leave the covariance zero. Such sightings were dropped, every
+    one, and odometry alone was left. Now their noise is measured: of the range, too, how it grows.
+    Means over four draws; what is left is the noise's own uncertainty."""
+    stated, found = [], []
+    for seed in range(4):
+        world = simulate(seed)
+        path = tmp_path / f"{seed}.mcap"
+        stated.append(judge(solved(path, world, increments=False), world))
+        result = solved(path, world, increments=False, cov=np.full((2, 2), unknown))
+        found.append(judge(result, world))
+        entry = result.summary["noise"]["robot point"]
+        assert entry["stated"] is False
+        sigmas = entry["sigmas"]
+        # 3000 sightings tell a sigma to 1.3 %, their solution takes some of the noise up
+        assert sigmas["bearing_rad"] == pytest.approx(SIGHTING[0], rel=0.06)
+        at_2_m = np.hypot(sigmas["range_m"], 2.0 * sigmas["range_share"])
+        assert at_2_m == pytest.approx(SIGHTING[1], rel=0.1)
+        lines = [w for w in result.summary["warnings"] if "state no covariances" in w]
+        assert len(lines) == 1 and "° of bearings" in lines[0]
+        assert not [w for w in result.summary["warnings"] if "what is stated" in w]
+    error, nees = np.mean(found, axis=0) / np.mean(stated, axis=0)
+    assert error < 1.05
+    assert 0.9 < nees < 1.15
+
+
+def test_few_sightings_that_state_no_noise_have_what_is_common(tmp_path):
+    """Breaks if a noise is said to be measured by a handful, or these are dropped."""
+    world = simulate(1, seconds=8.0)
+    few = replace(world, seen=world.seen[::8])
+    result = solved(tmp_path / "few.mcap", few, increments=True, cov=np.zeros((2, 2)))
+    assert result.summary["counts"]["observations"] == len(few.seen)
+    sigmas = result.summary["noise"]["robot point"]["sigmas"]
+    assert sigmas == pytest.approx(
+        {"bearing_rad": BEARING_RAD, "range_m": RANGE_M, "range_share": RANGE_SHARE}
+    )
+
+
+def test_causal_poses_use_the_noise_that_is_not_stated(tmp_path):
+    """After 3000 sightings; noise that is a quarter of what is common, used from then on."""
+    world = simulate(2, seconds=120.0, noise=0.25)
+    path = write(tmp_path / "log.mcap", world, increments=True, cov=np.zeros((2, 2)))
+    x, y, phi = (world.poses[0] + world.start).tolist()
+    config = load_config(
+        overrides=[
+            f"start.poses.robot=[{x}, {y}, {phi}]",
+            f"start.given_sigma_m={START}",
+            f"start.given_sigma_rad={START}",
+            "backend.causal=true",
+        ]
+    )
+    causal = smooth(open_logs([path], config), config).robots["robot"].causal
+    sigma = np.sqrt(causal.covs[:, 0, 0] + causal.covs[:, 1, 1])
+    before, after = (sigma[causal.stamps_ns < T0 + s * S][-1] for s in (60, 100))
+    # with the common noise sigmas grow on, by half in that time, as the map drifts
+    assert after < 0.75 * before
+    # one path's errors are correlated: three sigmas of one pose
+    off = causal.poses[-1, :2] - world.poses[-1, :2]
+    assert off @ np.linalg.solve(causal.covs[-1, :2, :2], off) < 12.0
 
 
 @pytest.mark.parametrize("column", [0, 1])
