@@ -137,6 +137,15 @@ def area_centroid(polygon: Array) -> Array:
     return np.asarray(middle + ((a + b) * twice[:, None]).sum(axis=0) / (3.0 * area))
 
 
+def chained(moved: Array) -> Array:
+    """Poses (n + 1, 3) along motions (n, 3), each in the frame of the pose before, from zero on."""
+    headings = np.append(0.0, np.cumsum(moved[:, 2]))
+    c, s = np.cos(headings[:-1]), np.sin(headings[:-1])
+    steps = np.column_stack([c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]])
+    places = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return np.column_stack([places, wrap(headings)])
+
+
 def path_length(points: Array) -> Array:
     """Length (n,), m, of the path through points or poses (n, 2 or 3) up to each of them."""
     x, y = (points[1:] - points[:-1])[:, :2].T

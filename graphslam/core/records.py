@@ -92,11 +92,10 @@ class Sighting(Message):
     """A landmark or another robot measured by bearing and range, perhaps with its direction.
 
     ``z`` is (bearing rad, range m) or (bearing, range, direction rad) in the sensor's frame, the
-    direction being the heading of the target relative to the sensor. ``cov`` is (2, 2) or
-    (3, 3). ``identity`` is None when unknown. ``seen_robot`` names a robot; where it is None,
-    ``may_be`` says what is seen: a ``landmark``, some ``robot``, or ``either``. Sightings of one
-    robot at one stamp form one image: they exclude each other. ``stated``: whether ``cov`` is what
-    its sensor says; else it is a beginning from which that is measured.
+    direction being the heading of the target relative to the sensor. ``cov`` is (2, 2) or (3, 3);
+    not ``stated``, it is to be measured. ``identity`` is None when unknown. ``seen_robot`` names a
+    robot; where it is None, ``may_be`` says what is seen: a ``landmark``, some ``robot``, or
+    ``either``. Sightings of one robot at one stamp form one image: they exclude each other.
     """
 
     z: Array

@@ -14,11 +14,12 @@ import numpy as np
 from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.gaussian import mahalanobis_squared
-from graphslam.core.geometry import Array, between, wrap
+from graphslam.core.geometry import Array, between, chained, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, RobotResult, Step
 from graphslam.mapping.doubled_walls import Displacement
 from graphslam.odometry.missing_increments import MissingIncrements
+from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.pipeline.path_evidence import NO_PATH, PathMisfits
 from graphslam.pipeline.robot_state import RobotState
@@ -41,9 +42,10 @@ class Seen:
 
     ``targets`` numbers what is seen, ``stands`` says that it is a landmark; ``z`` (n, 2) is bearing
     rad and range m of ``sigmas`` (n, 2); ``odometry`` (n, 3) the poses that they were made from by
-    odometry alone, ``poses`` (n, 3) the same in the result; ``d2`` their squared distances from
-    the result, per degree of freedom. ``names``: those of the targets, in the order of their
-    numbers; "" for robots and for landmarks without.
+    odometry alone, as recorded, ``calibrated`` (n, 3) as it was calibrated, ``poses`` (n, 3) the
+    same in the result; ``d2`` their squared distances from the result, per degree of freedom.
+    ``names``: those of the targets, in the order of their numbers; "" for robots and for landmarks
+    without.
     """
 
     times_ns: IntArray
@@ -52,6 +54,7 @@ class Seen:
     z: Array
     sigmas: Array
     odometry: Array
+    calibrated: Array
     poses: Array
     d2: Array
     names: tuple[str, ...] = ()
@@ -77,7 +80,8 @@ class RobotEvidence:
 
     ``source`` of its odometry; ``readings_ns`` (n,) and ``readings`` (n, 3), poses by odometry
     alone, its resets bridged; ``resets``: how many. ``stamps_ns`` (m,), ``final`` (m, 3) and
-    ``by_odometry`` (m, 3): some poses of the result, and the same by odometry. ``scans_ns`` (k,):
+    ``by_odometry`` (m, 3): some poses of the result, and the same by odometry, as recorded;
+    ``by_calibrated`` (m, 3) as it was calibrated. ``scans_ns`` (k,):
     when it had scans; ``repeated_ns`` (j, 2): of scans that were left out, as they repeat an
     earlier one, their times and those of the first that is the same. ``motions_ns`` (q,) when
     motions ended, ``contradicted`` (q,) whether scans contradicted them. ``seen``: what it saw.
@@ -97,6 +101,7 @@ class RobotEvidence:
     stamps_ns: IntArray
     final: Array
     by_odometry: Array
+    by_calibrated: Array
     scans_ns: IntArray
     repeated_ns: IntTable
     motions_ns: IntArray
@@ -177,6 +182,7 @@ def gather(
                 stamps_ns=result.final.stamps_ns[some],
                 final=result.final.poses[some],
                 by_odometry=result.dead_reckoning.poses[some],
+                by_calibrated=_by_calibrated(run.track, result.final.stamps_ns[some]),
                 scans_ns=np.array([time for _, time, _ in run.scans], dtype=np.int64),
                 repeated_ns=np.array(run.repeats.left_out, dtype=np.int64).reshape(-1, 2),
                 motions_ns=np.array([time for time, _ in motions], dtype=np.int64),
@@ -247,10 +253,18 @@ def _seen(
         z,
         np.sqrt(np.diagonal(covs, axis1=1, axis2=2)),
         run.track.mounted_pose(times) if n else np.zeros((0, 3)),
+        _by_calibrated(run.track, times) if n else np.zeros((0, 3)),
         estimate.states[usable[0].robot].at(times) if n else np.zeros((0, 3)),
         d2,
         tuple(identities.get(target, "") for target in numbers),
     )
+
+
+def _by_calibrated(track: Track, times_ns: IntArray) -> Array:
+    """Poses (n, 3) at ascending times by odometry as it was calibrated, from where it begins."""
+    unique, of = np.unique(times_ns, return_inverse=True)
+    moved = track.motions(unique[:-1], unique[1:]).delta
+    return chained(moved)[of]
 
 
 def _target(a: Association, estimate: Estimate) -> Array | None:

@@ -259,13 +259,37 @@ def _who_moved(robot: RobotEvidence, parked: Parked) -> str:
 
 
 def _factors(robot: RobotEvidence) -> Iterator[Reason]:
-    """Turning and path by odometry against those of the result, over parts of the log."""
+    """Turning and path by odometry against those of the result, if calibration does not explain it.
+
+    A robot that skids, or whose axle is another one, turns by half as much again as its odometry
+    says, all along. Odometry that is calibrated agrees with the result then.
+    """
+    worst = _contradictions(robot, robot.by_odometry)
+    if worst:
+        worst = {
+            name: worst[name] for name in worst.keys() & _contradictions(robot, robot.by_calibrated)
+        }
+    other = robot.other_sensor
+    for _, text in worst.values():
+        yield Reason(
+            "doubtful",
+            "odometry",
+            robot.name,
+            f"{robot.name}: its odometry and its {other} contradict each other: {text}",
+        )
+
+
+def _contradictions(robot: RobotEvidence, by_odometry: Array) -> dict[str, tuple[float, str]]:
+    """Turning, or forward motion -> how well poses (m, 3) by odometry agree with the result.
+
+    Where they do not agree, over the parts of the log; the worst one, and how it is told.
+    """
     times = (robot.stamps_ns - robot.stamps_ns[0]) * 1e-9
     if len(times) < 3 or not times[-1] > 0:
-        return
+        return {}
     grid = np.unique(np.searchsorted(times, np.arange(0.0, times[-1], SPAN_S)))
     ours = between(robot.final[grid[:-1]], robot.final[grid[1:]])
-    its = between(robot.by_odometry[grid[:-1]], robot.by_odometry[grid[1:]])
+    its = between(by_odometry[grid[:-1]], by_odometry[grid[1:]])
     known = np.isfinite(its).all(axis=1) & np.isfinite(ours).all(axis=1)
     parts = np.arange(len(ours)) * PARTS // max(len(ours), 1)
     worst: dict[str, tuple[float, str]] = {}
@@ -289,14 +313,7 @@ def _factors(robot: RobotEvidence) -> Iterator[Reason]:
                 score = min(agreement, FACTORS[0] / ratio, ratio / FACTORS[1])
                 if name not in worst or score < worst[name][0]:
                     worst[name] = score, _how(name, agreement, ratio, where)
-    other = robot.other_sensor
-    for _, text in worst.values():
-        yield Reason(
-            "doubtful",
-            "odometry",
-            robot.name,
-            f"{robot.name}: its odometry and its {other} contradict each other: {text}",
-        )
+    return worst
 
 
 def _opposite(robot: RobotEvidence) -> Iterator[Reason]:

@@ -160,10 +160,12 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
     seen = robot.seen
     a, b = _pairs_of(seen)
     moved = between(seen.odometry[a], seen.odometry[b])
+    calibrated = between(seen.calibrated[a], seen.calibrated[b])
     noise = np.hypot(*(seen.sigmas[b] / np.column_stack([np.ones(len(b)), seen.z[b, 1]])).T)
     size = np.hypot(moved[:, 0], moved[:, 1])
     moves = (size > MOVED_M) | (np.abs(moved[:, 2]) > MOVED_RAD)
     a, b, moved, noise = a[moves], b[moves], moved[moves], noise[moves]
+    calibrated = calibrated[moves]
     if len(a) < LEAST or _is_half_measured(seen.z[a]):
         return
     found: dict[str, list[int]] = {}
@@ -179,8 +181,11 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
         best = min(tried, key=lambda text: tried[text])
         what = best
         if tried[best] > BETTER * plain:
-            if plain < 3 * float(np.median(noise[own])):
+            limit = 3 * float(np.median(noise[own]))
+            if plain < limit:
                 continue  # it is noise
+            if float(_Pairs.of(z1, z2, calibrated[own]).disagreement()) < max(limit, TOLERANCE):
+                continue  # the calibration explains it
             what = CONTRADICTION
         found.setdefault(what, []).append(int(seen.times_ns[a[own]][0]))
     for what, times in found.items():

@@ -14,6 +14,7 @@ from graphslam.core.geometry import (
     adjoint,
     are_positive,
     between,
+    chained,
     compose,
     compose_cov,
     compose_jacobians,
@@ -359,3 +360,17 @@ def test_many_covariances_are_tested_as_each_is():
     assert 20 < found.sum() < 190
     assert found[4:].tolist() == [is_positive(cov) for cov in covs[4:]]
     assert not found[:4].any() and not is_positive(covs[2]) and not is_positive(covs[3])
+
+
+def test_motions_chained_are_those_between_the_poses():
+    """Breaks if a motion is along other axes than those of the pose before."""
+    rng = np.random.default_rng(1)
+    moved = rng.uniform(-1, 1, (50, 3)) * [1.0, 0.5, 3.0]
+    poses = chained(moved)
+    one = np.zeros(3)
+    for motion, pose in zip(moved, poses[1:], strict=True):
+        one = compose(one, motion)
+        # fifty additions of numbers of about 10 m
+        np.testing.assert_allclose(pose[:2], one[:2], atol=1e-12)
+        assert abs(wrap(pose[2] - one[2])) < 1e-12
+    assert chained(np.zeros((0, 3))).tolist() == [[0.0, 0.0, 0.0]]

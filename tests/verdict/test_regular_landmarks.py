@@ -52,6 +52,7 @@ def seen_twice(points, *, length=1.0, bend=0.0, named=False):
         z=np.column_stack([bearing, range_m]),
         sigmas=np.full((len(k), 2), 0.02),
         odometry=np.array(odometry)[k],
+        calibrated=np.array(odometry)[k],
         poses=final[k],
         d2=np.ones(len(k)),
         names=tuple(f"p{i}" if named else "" for i in range(len(points))),

@@ -41,7 +41,7 @@ def drive():
     return np.column_stack([0.06 + 0 * k, 0 * k, 0.03 + 0.03 * np.sin(0.05 * k)])
 
 
-def seen_from(poses, odometry):
+def seen_from(poses, odometry, calibrated):
     rng = np.random.default_rng(0)
     points = rng.uniform((-5, -3), (5, 7), (12, 2))
     rows = []
@@ -57,7 +57,10 @@ def seen_from(poses, odometry):
     times = S + k * S // 10
     targets, stands = rows[:, 1].astype(int), np.ones(len(rows), dtype=bool)
     names = tuple(f"p{n}" for n in range(len(points)))
-    return Seen(times, targets, stands, z, sigmas, odometry[k], poses[k], np.ones(len(rows)), names)
+    return Seen(
+        times, targets, stands, z, sigmas, odometry[k], calibrated[k], poses[k],
+        np.ones(len(rows)), names,
+    )  # fmt: skip
 
 
 def only(own, kept):
@@ -66,16 +69,20 @@ def only(own, kept):
     return replace(own, **{name: getattr(own, name)[kept] for name in columns})
 
 
-def evidence(steps=None, scans=False, seen=None, **changes):
-    """Of a healthy run, but for ``steps`` of its odometry and other ``changes``."""
+def evidence(steps=None, scans=False, seen=None, calibrated=None, **changes):
+    """Of a healthy run, but for ``steps`` of its odometry and other ``changes``.
+
+    ``calibrated``: those that calibration makes of them; as they are without.
+    """
     true = path(drive())
     odometry = path(drive() if steps is None else steps)
+    calibrated = odometry if calibrated is None else path(calibrated)
     times = S + np.arange(N) * S // 10
-    own = seen_from(true, odometry)
+    own = seen_from(true, odometry, calibrated)
     nothing = np.zeros(0, dtype=np.int64)
     robot = RobotEvidence(
         name="tom", source="odometry", readings_ns=times, readings=odometry, resets=0,
-        stamps_ns=times, final=true, by_odometry=odometry,
+        stamps_ns=times, final=true, by_odometry=odometry, by_calibrated=calibrated,
         scans_ns=times[::3] if scans else nothing, repeated_ns=nothing.reshape(0, 2),
         motions_ns=times[1:101], contradicted=np.zeros(100, dtype=bool),
         seen=seen(own) if seen else own, parked=(),
@@ -145,7 +152,7 @@ def test_a_parked_robot_may_watch_another_one(stands, verdict):
         z = np.column_stack([0.1 * np.ones(late.sum()), np.linspace(8.0, 2.0, late.sum())])
         kept = [getattr(own, name)[late] for name in ("times_ns", "targets", "stands")]
         return Seen(kept[0], 0 * kept[1], np.full(late.sum(), stands), z,
-                    own.sigmas[late], own.odometry[late], own.poses[late],
+                    own.sigmas[late], own.odometry[late], own.odometry[late], own.poses[late],
                     own.d2[late])  # fmt: skip
 
     still = evidence(
@@ -368,6 +375,7 @@ def paused(**changes):
     kept = (robot.scans_ns <= 20 * S) | (robot.scans_ns >= 24 * S)
     made = replace(
         robot, scans_ns=robot.scans_ns[kept], final=path(true), by_odometry=path(steps),
+        by_calibrated=path(steps),
         readings=path(steps), **changes,
     )  # fmt: skip
     return replace(found, robots=(made,))
@@ -394,7 +402,8 @@ def interrupted(*, counted):
     times = robot.scans_ns
     made = replace(
         robot, scans_ns=times[(times <= 20 * S) | (times >= 28 * S)], final=poses,
-        by_odometry=poses, readings=poses[kept], readings_ns=robot.readings_ns[kept],
+        by_odometry=poses, by_calibrated=poses, readings=poses[kept],
+        readings_ns=robot.readings_ns[kept],
     )  # fmt: skip
     return replace(found, robots=(made,))
 
@@ -403,11 +412,32 @@ def test_odometry_that_counts_in_a_pause_of_the_laser_is_no_doubt_there():
     assert "odometry stands" not in reasons(interrupted(counted=True))[1]
 
 
+@pytest.mark.parametrize("scans", [False, True])
+@pytest.mark.parametrize("factors", [(1, 1, 0.5), (1, 1, 1.7), (0.5, 1, 1)])
+def test_odometry_that_calibration_explains_is_no_doubt(scans, factors):
+    """A robot that skids as it turns is calibrated. As recorded, its odometry contradicts all."""
+    seen = no_sightings if scans else None
+    raw = evidence(changed(0, *factors), scans=scans, seen=seen)
+    assert "contradict each other" in reasons(raw)[1] or "half" in reasons(raw)[1]
+    explained = evidence(changed(0, *factors), scans=scans, seen=seen, calibrated=drive())
+    verdict, told = reasons(explained)
+    # half as long by odometry, or ranges twice as long: nobody can tell
+    assert verdict == "good" or (factors[0] != 1 and not scans and "half" in told)
+
+
+def test_a_part_that_calibration_does_not_explain_is_doubted():
+    """Breaks if odometry that fails in the end is taken for calibrated."""
+    failing = changed(300, 1, 1, 0.1)
+    found = evidence(failing, scans=True, seen=no_sightings, calibrated=failing * [1, 1, 2.0])
+    assert "contradict each other: turning" in reasons(found)[1]
+
+
 def sparse(found):
     (robot,) = found.robots
     made = replace(
         robot, scans_ns=robot.scans_ns[::15], stamps_ns=robot.stamps_ns[::45],
         final=robot.final[::45], by_odometry=robot.by_odometry[::45],
+        by_calibrated=robot.by_calibrated[::45],
     )  # fmt: skip
     return replace(found, robots=(made,))
 
