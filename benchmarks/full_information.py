@@ -279,7 +279,7 @@ def judged(log: Log, found: dict[str, tuple[Array, Array]]) -> tuple[float, floa
         off[:, 2] = wrap(off[:, 2])
         squared.append(np.sum(off[:, :2] ** 2, axis=1))
         nees.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covs), off) / 3)
-    return float(np.sqrt(np.mean(squared))), float(np.mean(nees))
+    return float(np.sqrt(np.concatenate(squared).mean())), float(np.concatenate(nees).mean())
 
 
 def smoothed(log: Log, kind: str, fault: str, folder: Path) -> tuple[float, float, int, float]:

@@ -89,13 +89,12 @@ class Scan(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighting(Message):
-    """A landmark or another robot measured by bearing and range, perhaps with its direction.
+    """A landmark or another robot measured by bearing and range.
 
-    ``z`` is (bearing rad, range m) or (bearing, range, direction rad) in the sensor's frame, the
-    direction being the heading of the target relative to the sensor. ``cov`` is (2, 2) or (3, 3);
-    not ``stated``, it is to be measured. ``identity`` is None when unknown. ``seen_robot`` names a
-    robot; where it is None, ``may_be`` says what is seen: a ``landmark``, some ``robot``, or
-    ``either``. Sightings of one robot at one stamp form one image: they exclude each other.
+    ``z`` is (bearing rad, range m), in the sensor's frame, maybe with the target's direction, rad,
+    relative to the sensor. ``cov`` (2, 2) or (3, 3), if not ``stated``, is to be measured.
+    ``identity`` is None when unknown. ``seen_robot`` names a robot; where it is None, ``may_be`` is
+    ``landmark``, ``robot``, or ``either``. Sightings of one robot at one stamp are one image.
     """
 
     z: Array

@@ -99,6 +99,20 @@ def widened(prior: Calibration, found: Calibration) -> Calibration:
     return replace(prior, cov=scaled(prior.cov, wider))
 
 
+def far_from_prior(prior: Calibration, found: Calibration) -> Calibration | None:
+    """A calibration found, to begin with when a log is read again; None if near its prior.
+
+    It was found among associations that were made with the prior. As likely as not some are wrong,
+    so it is known no better than to a third of what it is off by.
+    """
+    off = found.mean - prior.mean
+    sigma = np.maximum(np.sqrt(np.diag(prior.cov)), HELD_SIGMA)
+    is_far = (np.abs(off) > FAR_SIGMAS * sigma) & of_odometry(prior)
+    if not is_far.any():
+        return None
+    return replace(found, cov=found.cov + np.diag(is_far * (off / 3) ** 2))
+
+
 class _Problem(NamedTuple):
     """Linear measurements of k parameters, of which some are wrong.
 

@@ -10,6 +10,7 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import rotate_cov
+from graphslam.core.motion_models import Calibration
 from graphslam.core.records import Association, KeyframeScan, Sighting, Start, Step
 from graphslam.core.suggestions import start_option
 from graphslam.logs import LogSet
@@ -37,6 +38,7 @@ class PriorKnowledge:
     of the log are accepted. ``identities``: false identity -> right one, of what is sighted.
     ``clocks``: of robots whose clock is not that of the first. ``alone``: estimates of robots by
     themselves, from which their relative poses were found. ``known_map``: of an earlier result.
+    ``calibrations``: robot -> that which an earlier pass found far from its prior.
     """
 
     frame_assignment: FrameAssignment
@@ -45,6 +47,7 @@ class PriorKnowledge:
     clocks: Mapping[str, Clock] = field(default_factory=dict)
     alone: Mapping[str, RobotEstimate] = field(default_factory=dict)
     known_map: KnownMap | None = None
+    calibrations: Mapping[str, Calibration] = field(default_factory=dict)
 
 
 class LogPass:

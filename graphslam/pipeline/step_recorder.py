@@ -69,6 +69,9 @@ class StepRecorder(LogPass):
         Raises:
             EstimationError: it is not known where.
         """
+        if (known := self.known.calibrations.get(robot)) is not None:
+            run = self.runs[robot]
+            run.track.calibration = run.calibrator.restart(run.track.prior, known)
         step = self.start_step(robot, time_ns)
         self.record_covariances()
         self.backend.add(step)

@@ -4,11 +4,15 @@ Mostly one pass is enough. What it finds may show that the log should be read ag
 identities that were swapped, or robots' clocks that differ.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from graphslam.core.config import Config
 from graphslam.core.errors import LogError
+from graphslam.core.motion_models import nominal_calibration, of_odometry
 from graphslam.core.records import Estimate
 from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import ClockEstimate, estimate_clocks
@@ -17,9 +21,11 @@ from graphslam.logs import LogSet
 from graphslam.mapping.robot_candidates import NOT_THERE
 from graphslam.mapping.robot_gating import RobotOffers
 from graphslam.multi_robot.identity_swaps import find_swapped_identities
+from graphslam.odometry.far_calibration import far_from_prior
 from graphslam.pipeline.findings import Findings, FinishedPass
 from graphslam.pipeline.log_pass import LogPass, PriorKnowledge, Progress, timed
 from graphslam.pipeline.pipeline import Pipeline
+from graphslam.pipeline.robot_state import Causal
 from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.scan_smoothing.causal import causal_of
 from graphslam.scan_smoothing.reoptimise_scans import reoptimise_scan_log
@@ -28,6 +34,8 @@ from graphslam.slam.initialisation import with_identities
 
 #: how often a log is read again at most, with corrected clocks
 MAX_CLOCK_PASSES = 1
+#: and with calibrations that an earlier pass found
+MAX_CALIBRATION_PASSES = 3
 
 
 def run_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass:
@@ -42,7 +50,8 @@ def run_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass:
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
     log, config = job.log, job.config
-    clock_passes = 0
+    clock_passes = calibration_passes = 0
+    causal: Mapping[str, Causal] | None = None  # of a pass that began without calibrations found
     while True:
         pipeline = Pipeline(log, config, known, job.tamper)
         estimate, is_rough = job.kept.read_pass(
@@ -58,7 +67,14 @@ def run_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass:
             if following is None:
                 if is_rough and not at_once:
                     final = reoptimise(pipeline, estimate)
-                return FinishedPass(pipeline, final, findings)
+                if is_rough and calibration_passes < MAX_CALIBRATION_PASSES:
+                    following = with_far_calibrations(known, pipeline)
+                if causal is not None:
+                    findings = findings._replace(causal=causal)
+                if following is None:
+                    return FinishedPass(pipeline, final, findings)
+                causal = findings.causal
+                calibration_passes += 1
         clock_passes += following.clocks is not known.clocks
         known = following
 
@@ -82,6 +98,36 @@ def decide_next_pass(
     ):
         return replace(known, clocks={robot: c.clock for robot, c in findings.clocks.items()})
     return None
+
+
+def with_far_calibrations(known: PriorKnowledge, pipeline: Pipeline) -> PriorKnowledge | None:
+    """What another pass over unnamed sightings is to begin with, where odometry is far off.
+
+    Sightings without names are associated by odometry: where a robot turns half as much again as
+    its odometry says, they are taken for new points until that is known, and the map is there
+    twice.
+
+    Args:
+        known: what the last pass began with.
+        pipeline: the last pass, solved again.
+
+    Returns:
+        None if it began with what it found, to a sigma before any data.
+    """
+    if not is_sighting_log(pipeline):
+        return None
+    found, moved = {}, False
+    for name, run in pipeline.started.items():
+        track, before = run.track, known.calibrations.get(name)
+        prior = nominal_calibration(track.source, track.config, track.is_mounted)
+        far = far_from_prior(prior, track.calibration)
+        if far is None:
+            continue
+        found[name] = far
+        begun = prior.mean if before is None else before.mean
+        off = np.abs(track.calibration.mean - begun)
+        moved |= bool((off > np.sqrt(np.diag(prior.cov)))[of_odometry(prior)].any())
+    return replace(known, calibrations=found) if moved else None
 
 
 def run_pass(pipeline: Pipeline, progress: Progress) -> Pipeline:

@@ -14,7 +14,7 @@ from graphslam.odometry.contradicted_motions import (
     ContradictedMotions,
     without_explained,
 )
-from graphslam.odometry.far_calibration import FAR_SIGMAS, explain, widened
+from graphslam.odometry.far_calibration import FAR_SIGMAS, explain, far_from_prior, widened
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.scan_odometry import CONTRADICTION_D2
 from tests.odometry.test_online_calibration import CENTRED, NOTHING, Drive, weaving
@@ -138,3 +138,20 @@ def test_a_prior_is_wider_only_for_the_odometry_and_only_beyond_its_tails():
         assert (found.cov[at, at] > PRIOR.cov[at, at]) == wider
         others = np.arange(len(mean)) != at
         np.testing.assert_array_equal(np.diag(found.cov)[others], np.diag(PRIOR.cov)[others])
+
+
+def test_a_log_is_read_again_only_for_odometry_far_off_and_with_doubt_in_what_was_found():
+    """Breaks if a latency, or two sigmas of the prior, cost another pass, or if a calibration that
+    was found among false associations is taken for certain."""
+    prior = nominal_calibration("odometry", OdometryConfig(), mounted=True)
+    sigma = np.sqrt(np.diag(prior.cov))
+    cov = np.diag((sigma / 10) ** 2)
+    near = replace(prior, mean=2.0 * sigma * (np.arange(7) != 6), cov=cov)
+    late = replace(prior, mean=10.0 * sigma * (np.arange(7) == 6), cov=cov)
+    assert far_from_prior(prior, near) is None and far_from_prior(prior, late) is None
+    far = replace(prior, mean=10.0 * sigma * (np.arange(7) == 1), cov=cov)
+    begun = far_from_prior(prior, far)
+    np.testing.assert_array_equal(begun.mean, far.mean)
+    expected = sigma / 10
+    expected[1] = np.hypot(sigma[1] / 10, far.mean[1] / 3)
+    np.testing.assert_allclose(np.sqrt(np.diag(begun.cov)), expected, rtol=1e-12)
