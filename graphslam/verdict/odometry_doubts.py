@@ -259,16 +259,15 @@ def _who_moved(robot: RobotEvidence, parked: Parked) -> str:
 
 
 def _factors(robot: RobotEvidence) -> Iterator[Reason]:
-    """Turning and path by odometry against those of the result, if calibration does not explain it.
+    """Turning and path by odometry against those of the result, over parts of the log.
 
     A robot that skids, or whose axle is another one, turns by half as much again as its odometry
-    says, all along. Odometry that is calibrated agrees with the result then.
+    says, all along. Odometry that is calibrated agrees with the result then. Of paths that is no
+    excuse: ranges that are twice as long look like odometry that is half as long.
     """
     worst = _contradictions(robot, robot.by_odometry)
-    if worst:
-        worst = {
-            name: worst[name] for name in worst.keys() & _contradictions(robot, robot.by_calibrated)
-        }
+    if "turning" in worst and "turning" not in _contradictions(robot, robot.by_calibrated):
+        del worst["turning"]
     other = robot.other_sensor
     for _, text in worst.values():
         yield Reason(

@@ -160,7 +160,9 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
     seen = robot.seen
     a, b = _pairs_of(seen)
     moved = between(seen.odometry[a], seen.odometry[b])
-    calibrated = between(seen.calibrated[a], seen.calibrated[b])
+    # ranges that are too long look like odometry whose path is too short, but angles are angles
+    calibrated = moved.copy()
+    calibrated[:, 2] = between(seen.calibrated[a], seen.calibrated[b])[:, 2]
     noise = np.hypot(*(seen.sigmas[b] / np.column_stack([np.ones(len(b)), seen.z[b, 1]])).T)
     size = np.hypot(moved[:, 0], moved[:, 1])
     moves = (size > MOVED_M) | (np.abs(moved[:, 2]) > MOVED_RAD)
@@ -185,7 +187,7 @@ def _pairs(robot: RobotEvidence) -> Iterator[Reason]:
             if plain < limit:
                 continue  # it is noise
             if float(_Pairs.of(z1, z2, calibrated[own]).disagreement()) < max(limit, TOLERANCE):
-                continue  # the calibration explains it
+                continue  # a calibration of turning explains it
             what = CONTRADICTION
         found.setdefault(what, []).append(int(seen.times_ns[a[own]][0]))
     for what, times in found.items():
