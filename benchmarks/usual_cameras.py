@@ -67,7 +67,7 @@ NOISES: Mapping[str, Callable[[Array], Array]] = {
 DRIFT_M, DRIFT_RAD, TURN_RAD = 0.01, 0.02, 0.02
 #: share of what is in sight that is not seen
 MISSED = 0.1
-ODOMETRY = ((1.0, 1.0), (1.0, 0.6), (1.0, 1.5), (1.0, 2.0), (0.6, 1.0))
+ODOMETRY = ((1.0, 1.0), (1.0, 0.6), (1.0, 1.5), (1.0, 2.0), (0.75, 1.0))
 MOST_TIMES = 1.5
 
 

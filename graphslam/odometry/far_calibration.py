@@ -99,18 +99,25 @@ def widened(prior: Calibration, found: Calibration) -> Calibration:
     return replace(prior, cov=scaled(prior.cov, wider))
 
 
-def far_from_prior(prior: Calibration, found: Calibration) -> Calibration | None:
+def far_from_prior(
+    prior: Calibration, begun: Calibration, found: Calibration
+) -> Calibration | None:
     """A calibration found, to begin with when a log is read again; None if near its prior.
 
-    It was found among associations that were made with the prior. As likely as not some are wrong,
-    so it is known no better than to a third of what it is off by.
+    It was found among associations that were made with another. As likely as not some are wrong, so
+    it is known no better than to a third of what it moved by.
+
+    Args:
+        prior: before any data.
+        begun: what the log was read with.
+        found: in the solution.
     """
-    off = found.mean - prior.mean
     sigma = np.maximum(np.sqrt(np.diag(prior.cov)), HELD_SIGMA)
-    is_far = (np.abs(off) > FAR_SIGMAS * sigma) & of_odometry(prior)
+    is_far = (np.abs(found.mean - prior.mean) > FAR_SIGMAS * sigma) & of_odometry(prior)
     if not is_far.any():
         return None
-    return replace(found, cov=found.cov + np.diag(is_far * (off / 3) ** 2))
+    moved = found.mean - begun.mean
+    return replace(found, cov=found.cov + np.diag(is_far * (moved / 3) ** 2))
 
 
 class _Problem(NamedTuple):

@@ -112,22 +112,24 @@ def with_far_calibrations(known: PriorKnowledge, pipeline: Pipeline) -> PriorKno
         pipeline: the last pass, solved again.
 
     Returns:
-        None if it began with what it found, to a sigma before any data.
+        None if it began with what it found, to a sigma before any data, and was as sure of it.
     """
     if not is_sighting_log(pipeline):
         return None
-    found, moved = {}, False
+    found, is_again = {}, False
     for name, run in pipeline.started.items():
-        track, before = run.track, known.calibrations.get(name)
+        track = run.track
         prior = nominal_calibration(track.source, track.config, track.is_mounted)
-        far = far_from_prior(prior, track.calibration)
+        begun = known.calibrations.get(name, prior)
+        far = far_from_prior(prior, begun, track.calibration)
         if far is None:
             continue
         found[name] = far
-        begun = prior.mean if before is None else before.mean
-        off = np.abs(track.calibration.mean - begun)
-        moved |= bool((off > np.sqrt(np.diag(prior.cov)))[of_odometry(prior)].any())
-    return replace(known, calibrations=found) if moved else None
+        usual = np.sqrt(np.diag(prior.cov))
+        again = np.abs(far.mean - begun.mean) > usual
+        again |= np.sqrt(np.diag(begun.cov)) > 1.01 * usual  # read with more doubt than usual
+        is_again |= bool(again[of_odometry(prior)].any())
+    return replace(known, calibrations=found) if is_again else None
 
 
 def run_pass(pipeline: Pipeline, progress: Progress) -> Pipeline:

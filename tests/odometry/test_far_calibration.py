@@ -148,10 +148,12 @@ def test_a_log_is_read_again_only_for_odometry_far_off_and_with_doubt_in_what_wa
     cov = np.diag((sigma / 10) ** 2)
     near = replace(prior, mean=2.0 * sigma * (np.arange(7) != 6), cov=cov)
     late = replace(prior, mean=10.0 * sigma * (np.arange(7) == 6), cov=cov)
-    assert far_from_prior(prior, near) is None and far_from_prior(prior, late) is None
+    assert far_from_prior(prior, prior, near) is None
+    assert far_from_prior(prior, prior, late) is None
     far = replace(prior, mean=10.0 * sigma * (np.arange(7) == 1), cov=cov)
-    begun = far_from_prior(prior, far)
-    np.testing.assert_array_equal(begun.mean, far.mean)
-    expected = sigma / 10
-    expected[1] = np.hypot(sigma[1] / 10, far.mean[1] / 3)
-    np.testing.assert_allclose(np.sqrt(np.diag(begun.cov)), expected, rtol=1e-12)
+    for before, doubt in ((prior, far.mean[1] / 3), (far, 0.0)):
+        begun = far_from_prior(prior, before, far)
+        np.testing.assert_array_equal(begun.mean, far.mean)
+        expected = sigma / 10
+        expected[1] = np.hypot(sigma[1] / 10, doubt)
+        np.testing.assert_allclose(np.sqrt(np.diag(begun.cov)), expected, rtol=1e-12)
