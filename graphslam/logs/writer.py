@@ -223,7 +223,7 @@ class LogWriter:
         sensor: str = "base_link",
         log_time_ns: int | None = None,
     ) -> None:
-        """Sighting on ``sightings``: ``z`` (2,) or (3,), ``cov`` (2, 2) or (3, 3).
+        """Sighting on ``sightings``: ``z`` (2,) or (3,), ``cov`` (2, 2) or (3, 3), zero if unknown.
 
         ``z`` is (bearing rad, range m[, direction rad]) in the frame of ``sensor``. ``seen_robot``
         is the name of a robot, `schemas.SOME_ROBOT` or `schemas.ANYTHING`; None for a landmark.
