@@ -164,7 +164,9 @@ def _estimated(
         tracks[name].config = without_floors(tracks[name].config)
     measured: dict[Source, Array] = {}
     fits: dict[str, NoiseFit] = {}
-    for _ in range(rounds):
+    # noise that is not stated may be of any size: before that is known, errors that are larger than
+    # it began with seem to be shared
+    for k in range(-1 if unstated else 0, rounds):
         initial = {name: track.calibration for name, track in tracks.items()}
         for track in tracks.values():
             track.calibration = track.calibration.held()
@@ -176,7 +178,7 @@ def _estimated(
         posterior = graph.posterior(stated)
         new = _sighting_noise(posterior, noise)
         change = _largest_change(noise, new)
-        noise = new
+        noise = new if k >= 0 else new | _begun_again(new, unstated)
         covs = graph.calibration_covariances(posterior)
         for name, track in tracks.items():
             track.calibration = replace(calibrations[name], cov=covs[name])
@@ -189,6 +191,8 @@ def _estimated(
         for track in open_ones.values():
             track.config = without_floors(track.config)
         odometry_change = max((fit.change for fit in fits.values()), default=0.0)
+        if k < 0:
+            continue
         if max(change, odometry_change) < CONVERGED_SHARE:
             break
         if not is_white(noise) and odometry_change < UNSETTLED_SHARE:
@@ -203,6 +207,14 @@ def _estimated(
     }
     odometry = {name: track.config for name, track in tracks.items()}
     return LogNoise(final, odometry, measured), posterior
+
+
+def _begun_again(
+    noise: Mapping[Source, ObservationNoise], sources: Collection[Source]
+) -> dict[Source, ObservationNoise]:
+    """Noise of the size found, of which it is open again whether errors are shared."""
+    own = {source: noise[source] for source in sources if source in noise}
+    return {s: ObservationNoise(n.white, n.white, n.kernel_scale) for s, n in own.items()}
 
 
 def _sighting_noise(
