@@ -351,16 +351,16 @@ def test_sightings_that_state_no_noise_are_as_good_as_those_that_do(tmp_path):
     assert 0.9 < nees < 1.15
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [3, 4])
 def test_noise_larger_than_common_is_not_taken_for_errors_that_are_shared(tmp_path, seed):
     """Breaks if that is decided while noise has the size that it begins with: then what is larger
-    seemed to be shared, in two of four logs, with 1.4 times the error in one."""
-    world = simulate(seed, noise=3.0)
+    seemed to be shared, in both of these."""
+    world = simulate(seed, noise=5.0)
     result = solved(tmp_path / "log.mcap", world, increments=False, cov=np.zeros((2, 2)))
     entry = result.summary["noise"]["robot point"]
     assert entry["shared"] == [0.0, 0.0]
     # see above
-    assert entry["sigmas"]["bearing_rad"] == pytest.approx(3.0 * SIGHTING[0], rel=0.06)
+    assert entry["sigmas"]["bearing_rad"] == pytest.approx(5.0 * SIGHTING[0], rel=0.06)
 
 
 def test_few_sightings_that_state_no_noise_have_what_is_common(tmp_path):
