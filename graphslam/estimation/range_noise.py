@@ -21,7 +21,7 @@ GAIN = 8.0
 
 
 class RangeNoise(NamedTuple):
-    """Variance of a range r: ``constant`` (m²) plus ``share`` squared times r²."""
+    """Variance of the noise of a range r, m²: ``constant_m2`` + ``share2`` r²."""
 
     constant_m2: float
     share2: float

@@ -76,7 +76,8 @@ def estimate_noise(
         tracks: odometry of every robot; they get the calibration that is found on the way.
         config: settings.
         rounds: at most. Errors that are shared show in the first, which is the last then, unless
-            the odometry is much noisier than it was taken for.
+            the odometry is much noisier than it was taken for. Where noise is not stated, one more
+            round before these finds its size.
 
     Raises:
         EstimationError: the estimate is indeterminate.

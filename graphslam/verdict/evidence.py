@@ -59,6 +59,11 @@ class Seen:
     d2: Array
     names: tuple[str, ...] = ()
 
+    def at_images(self) -> tuple[IntArray, Array, Array]:
+        """Times (m,) at which something was seen, and there ``odometry`` and ``poses`` (m, 3)."""
+        times_ns, first = np.unique(self.times_ns, return_index=True)
+        return times_ns, self.odometry[first], self.poses[first]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosureMisfits:
@@ -140,6 +145,15 @@ class Evidence:
     told: tuple[ToldStart, ...] = ()
     displacements: Mapping[str, Displacement] = field(default_factory=dict)
     kernel: RobustConfig = field(default_factory=RobustConfig)
+
+    @property
+    def without_scans(self) -> tuple[RobotEvidence, ...]:
+        """Robots with odometry of which sightings alone can tell how they moved."""
+        return tuple(
+            robot
+            for robot in self.robots
+            if not len(robot.scans_ns) and robot.name not in self.without_odometry
+        )
 
     @property
     def begin_ns(self) -> int:

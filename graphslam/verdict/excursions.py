@@ -37,12 +37,8 @@ class Excursion:
 
 def excursion_doubts(evidence: Evidence) -> Iterator[Reason]:
     """Robots without scans whose sightings take them off and back."""
-    for robot in evidence.robots:
-        if len(robot.scans_ns) or robot.name in evidence.without_odometry:
-            continue
-        seen = robot.seen
-        times_ns, first = np.unique(seen.times_ns, return_index=True)
-        found = largest_excursion(times_ns, seen.odometry[first], seen.poses[first])
+    for robot in evidence.without_scans:
+        found = largest_excursion(*robot.seen.at_images())
         if found is None:
             continue
         begin, end = (seconds(t, evidence.begin_ns) for t in (found.begin_ns, found.end_ns))

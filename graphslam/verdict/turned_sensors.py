@@ -32,12 +32,8 @@ LARGE = {
 
 def turned_sensor_doubts(evidence: Evidence) -> Iterator[Reason]:
     """Robots without scans whose sightings are turned against the direction in which they drive."""
-    for robot in evidence.robots:
-        if len(robot.scans_ns) or robot.name in evidence.without_odometry:
-            continue
-        seen = robot.seen
-        times_ns, first = np.unique(seen.times_ns, return_index=True)
-        found = driven_aside(times_ns, seen.odometry[first], seen.poses[first])
+    for robot in evidence.without_scans:
+        found = driven_aside(*robot.seen.at_images())
         if found is None:
             continue
         angle, sigma = found
