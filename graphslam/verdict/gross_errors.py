@@ -130,24 +130,27 @@ def misplaced_doubts(evidence: Evidence) -> Iterator[Reason]:
             yield Reason("doubtful", "misplaced", robot.name, text)
 
 
-def without_harmless(evidence: Evidence) -> Evidence:
-    """The evidence without the gross errors that do no harm."""
-    robots, error, dof = [], 0.0, 0
+def without_harmless(evidence: Evidence) -> tuple[Evidence, tuple[Fact, ...]]:
+    """The evidence without the gross errors that do no harm, and what is to be told of all."""
+    robots, facts, error, dof = [], [], 0.0, 0
     for robot in evidence.robots:
-        left_out = find_gross_errors(robot.seen, evidence.kernel).harmless
-        robots.append(replace(robot, seen=_only(robot.seen, ~left_out)))
+        found = find_gross_errors(robot.seen, evidence.kernel)
+        robots.append(replace(robot, seen=_only(robot.seen, ~found.harmless)))
         rows = robot.seen.z.shape[1]
-        error += 0.5 * rows * float(robot.seen.d2[left_out].sum())
-        dof += rows * int(left_out.sum())
+        error += 0.5 * rows * float(robot.seen.d2[found.harmless].sum())
+        dof += rows * int(found.harmless.sum())
+        if found.gross.any():
+            facts.append(_fact(robot.name, found))
     if not dof:
-        return evidence
+        return evidence, tuple(facts)
     graph = evidence.summary["graph"]
     graph = {
         **graph,
         "error_without_kernels": graph["error_without_kernels"] - error,
         "dof": graph["dof"] - dof,
     }
-    return replace(evidence, robots=tuple(robots), summary={**evidence.summary, "graph": graph})
+    summary = {**evidence.summary, "graph": graph}
+    return replace(evidence, robots=tuple(robots), summary=summary), tuple(facts)
 
 
 def _only(seen: Seen, kept: BoolArray) -> Seen:
@@ -155,18 +158,14 @@ def _only(seen: Seen, kept: BoolArray) -> Seen:
     return replace(seen, **{name: getattr(seen, name)[kept] for name in columns})
 
 
-def gross_error_facts(evidence: Evidence) -> Iterator[Fact]:
-    """How many of each robot's sightings are gross errors, and what that means."""
-    for robot in evidence.robots:
-        found = find_gross_errors(robot.seen, evidence.kernel)
-        number, harmless, n = int(found.gross.sum()), int(found.harmless.sum()), len(found.gross)
-        if not number:
-            continue
-        text = f"{robot.name}: {100 * number / n:.2g} % of its {n} sightings are gross errors"
-        if harmless == number:
-            text += ", each by itself: they hardly count"
-        elif number > MOST * n:
-            text += ", too many to be harmless"
-        else:
-            text += f", {number - harmless} of {number} not by themselves"
-        yield Fact(robot.name, number / n, text)
+def _fact(robot: str, found: GrossErrors) -> Fact:
+    """How many of a robot's sightings are gross errors, and what that means."""
+    number, harmless, n = int(found.gross.sum()), int(found.harmless.sum()), len(found.gross)
+    text = f"{robot}: {100 * number / n:.2g} % of its {n} sightings are gross errors"
+    if harmless == number:
+        text += ", each by itself: they hardly count"
+    elif number > MOST * n:
+        text += ", too many to be harmless"
+    else:
+        text += f", {number - harmless} of {number} not by themselves"
+    return Fact(robot, number / n, text)

@@ -18,11 +18,7 @@ from graphslam.logs.time_order import TOO_LATE
 from graphslam.verdict.doubts import Reason, seconds
 from graphslam.verdict.evidence import Evidence
 from graphslam.verdict.excursions import excursion_doubts
-from graphslam.verdict.gross_errors import (
-    gross_error_facts,
-    misplaced_doubts,
-    without_harmless,
-)
+from graphslam.verdict.gross_errors import misplaced_doubts, without_harmless
 from graphslam.verdict.moved_points import moved_doubts
 from graphslam.verdict.odometry_doubts import odometry_doubts
 from graphslam.verdict.regular_landmarks import regular_landmark_doubts
@@ -57,9 +53,9 @@ def judge(evidence: Evidence) -> dict[str, Any]:
 
     Gross errors that do no harm are facts, and no check sees them.
     """
-    facts = [asdict(fact) for fact in gross_error_facts(evidence)]
-    rest = without_harmless(evidence)
-    return to_summary((r for check in CHECKS.values() for r in check(rest)), facts)
+    rest, facts = without_harmless(evidence)
+    reasons = (reason for check in CHECKS.values() for reason in check(rest))
+    return to_summary(reasons, [asdict(fact) for fact in facts])
 
 
 def to_summary(
