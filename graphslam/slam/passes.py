@@ -127,7 +127,7 @@ def with_far_calibrations(known: PriorKnowledge, pipeline: Pipeline) -> PriorKno
         found[name] = far
         usual = np.sqrt(np.diag(prior.cov))
         again = np.abs(far.mean - begun.mean) > usual
-        again |= np.sqrt(np.diag(begun.cov)) > 1.01 * usual  # read with more doubt than usual
+        again |= np.sqrt(np.diag(begun.cov)) > usual  # read with more doubt than usual
         is_again |= bool(again[of_odometry(prior)].any())
     return replace(known, calibrations=found) if is_again else None
 
