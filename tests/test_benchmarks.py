@@ -69,6 +69,7 @@ SMALL: dict[str, list[str]] = {
         "--seconds",
         "40",
     ],
+    "noisy_lasers.py": ["lab", "--noise", "0.05:0", "--seeds", "1"],
     "usual_robots.py": ["lab", "--lasers", "LDS-01", "--axle", "0.5", "--seeds", "1"],
     "wrong_odometry.py": ["--seeds", "1"],
     "yardstick.py": [],

@@ -209,9 +209,12 @@ class FrontEndConfig:
     one segment. split_rule: `deviation` splits a chain by that; `variance` a whole scan until the
     mean square deviation is below (split_m / 2)², as thesis 4.7.6 prints it. hidden_ends: a segment
     of which an end may be hidden is kept as a `line`, or `reject`ed as in thesis 4.7.8. min_points,
-    min_length_m: smaller segments are dropped. range_sigma_m: white range noise. floor_normal_m,
-    floor_angle_rad: error of a line that does not shrink with the number of points (material,
-    flatness, bias of the laser). end_sigma_m: error of a segment's end where the wall ends.
+    min_length_m: smaller segments are dropped. range_sigma_m, range_sigma_ratio: white range noise,
+    and what it grows by with the range (the root of the sum of their squares counts); unless one of
+    them is set, the noise of the log's lasers is measured and used where it is larger. Where 2.5
+    sigmas are more than split_m, they are the largest deviation. floor_normal_m, floor_angle_rad:
+    error of a line that does not shrink with the number of points (material, flatness, bias of the
+    laser). end_sigma_m: error of a segment's end where the wall ends.
     covariance: `incidence` weights each point by its noise along the normal, `thesis` uses eq. 4.32
     as printed. Hough lines (4.7.1-4.7.3): hough_votes says what counts votes, `opencv`'s transform
     with the thesis' weights to rank and refine its lines, or the weighted accumulator of the
@@ -234,6 +237,7 @@ class FrontEndConfig:
     min_points: int = 6
     min_length_m: float = 0.4
     range_sigma_m: float = 0.02
+    range_sigma_ratio: float = 0.0
     floor_normal_m: float = 0.01
     floor_angle_rad: float = 0.005
     end_sigma_m: float = 0.05

@@ -33,6 +33,7 @@ NOISE = {
     "radius_error_left",
     "radius_error_right",
     "range_sigma_m",
+    "range_sigma_ratio",
     "slip_m",
 }
 

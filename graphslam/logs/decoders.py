@@ -17,6 +17,7 @@ from graphslam.core.geometry import Array
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
+from graphslam.logs.laser_noise import RangeNoise
 from graphslam.logs.mounts import Mount, levelled
 from graphslam.logs.point_cloud import beam_step, cloud_points, is_planar, sweep_of
 from graphslam.logs.record_checks import (
@@ -47,8 +48,9 @@ class TopicContext:
 
     ``mounts`` gives the pose (3,) of each sensor frame in the base frame; ``inverted`` names the
     frames of sensors that are mounted upside down, ``tilted`` has the mounts of those that are not
-    level. Ranges of ``no_return_m`` or more mean no
-    return. With ``at_once`` all beams of a scan count as measured at its stamp. ``beams`` counts
+    level. Ranges of ``no_return_m`` or more mean no return; ``range_noise`` is that of the others,
+    None where it is not known. With ``at_once`` all beams of a scan count as measured at its stamp.
+    ``beams`` counts
     dropped beams of scans that are kept, by reason. With ``without_ranges`` scans get no ranges:
     only when they were taken is of interest. ``by_log_time``: the messages have no stamps; that of
     their recording is taken. ``sensor``: see `records.Scan`. ``only_frame``: if given, scans
@@ -61,6 +63,7 @@ class TopicContext:
     inverted: frozenset[str] = frozenset()
     tilted: Mapping[str, Mount] = field(default_factory=dict)
     no_return_m: float = np.inf
+    range_noise: RangeNoise | None = None
     at_once: bool = False
     left_joint: str = ""
     right_joint: str = ""

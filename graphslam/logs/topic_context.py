@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from graphslam.core import records
 from graphslam.core.config import Config
@@ -16,6 +17,7 @@ from graphslam.logs.cdr import HEADER, CdrError
 from graphslam.logs.contradictions import contradictions
 from graphslam.logs.decoders import TopicContext, frame_of
 from graphslam.logs.findings import Finding
+from graphslam.logs.laser_noise import find_range_noise
 from graphslam.logs.mounts import (
     MAX_TILT_RAD,
     Mount,
@@ -225,6 +227,10 @@ class _SensorFrames:
             findings += odd_limits(topic.name, limits)
             no_return = find_no_return(message.ranges for message in messages)
             told["no_return_m"] = np.inf if no_return is None else no_return
+            told["range_noise"] = find_range_noise(
+                (np.where(_is_return(m, told["no_return_m"]), m.ranges, np.nan), m.angle_increment)
+                for m in messages
+            )
         return told, findings
 
     def _base(self, topic: Topic, frame: str, tree: TransformTree) -> str:
@@ -233,6 +239,12 @@ class _SensorFrames:
         if topic.robot in self._by_wheels and above.rpartition("/")[2].startswith("base"):
             return above  # no message of the wheels names it
         return self._bases.get(topic.robot, above)
+
+
+def _is_return(scan: Any, no_return_m: float) -> NDArray[np.bool_]:
+    """Which ranges (n,) of a message are measured."""
+    ranges = np.asarray(scan.ranges)
+    return np.asarray((ranges >= scan.range_min) & (ranges < min(scan.range_max, no_return_m)))
 
 
 def _one_laser(

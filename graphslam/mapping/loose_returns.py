@@ -23,6 +23,7 @@ from graphslam.core.records import Association, Estimate, KeyframeScan, Step
 from graphslam.mapping.landmark_map import Entry, observed_from
 from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
 from graphslam.mapping.submaps import State
+from graphslam.perception.range_noise import largest_deviation
 
 #: rad: how well the direction of a scan is known before (one sigma)
 HEADING_RAD = 0.003
@@ -113,7 +114,7 @@ def _observed(
     scan of the views that get an observation.
     """
     walls = len(numbers)
-    loose = np.flatnonzero(~_in_segments(seen, views, config.split_m))
+    loose = np.flatnonzero(~_in_segments(seen, views, config))
     found = _on_walls(loose, views, tree, config)
     if not len(found.row):
         return
@@ -220,7 +221,7 @@ class _Seen(NamedTuple):
         return found
 
 
-def _in_segments(seen: _Seen, views: _Views, reach_m: float) -> BoolArray:
+def _in_segments(seen: _Seen, views: _Views, config: FrontEndConfig) -> BoolArray:
     """Which returns (n,) are on a part of a wall that was seen as a segment."""
     number = views.number[seen.scan]
     i = np.repeat(np.arange(len(seen.scan)), number)
@@ -228,8 +229,10 @@ def _in_segments(seen: _Seen, views: _Views, reach_m: float) -> BoolArray:
     along, across = _along_and_across(views.points[p], seen.z, i)
     low, high = seen.extents.T
     inside = (along > (low - MARGIN_M)[i]) & (along < (high + MARGIN_M)[i])
+    square_ranges = ((views.points - views.lasers[views.scan]) ** 2).sum(axis=1)
+    reach_m = np.broadcast_to(largest_deviation(config, square_ranges), len(views.points))
     found = np.zeros(len(views.points), dtype=np.bool_)
-    found[p[inside & (np.abs(across) < reach_m)]] = True
+    found[p[inside & (np.abs(across) < reach_m[p])]] = True
     return found
 
 

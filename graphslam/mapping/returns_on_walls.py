@@ -18,6 +18,7 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array
 from graphslam.mapping.wall_samples import sample_walls
 from graphslam.perception.line_fit import SMALLEST_SIGMA_M
+from graphslam.perception.range_noise import range_variance
 
 #: m: walls are sampled at this distance to find those near a return
 SAMPLE_M = 0.25
@@ -128,7 +129,8 @@ def returns_on_walls(
     row, wall, along, across, c, s = (v[inside] for v in (row, wall, along, across, c, s))
     dx, dy = (points[row] - lasers[row]).T
     lever, normal = c * dx + s * dy, c * dy - s * dx
-    noise = config.range_sigma_m * np.abs(normal) / np.hypot(lever, normal)
+    square = lever * lever + normal * normal
+    noise = np.sqrt(range_variance(config, square) / square) * np.abs(normal)
     sigma = np.maximum(noise, max(config.floor_normal_m, SMALLEST_SIGMA_M))
     turn, place = (np.broadcast_to(v, len(points))[row] for v in (heading_rad, place_m))
     reach = gate * np.sqrt(sigma**2 + (turn * lever) ** 2 + place**2)

@@ -10,7 +10,7 @@ The work grows with the number of scans and of walls; a scan has a limited numbe
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform_each, wrap
 from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
+from graphslam.perception.range_noise import noisier
 
 #: sigmas that a return may be off the wall that it is taken for, and from which on it pulls with
 #: less than its distance (Huber)
@@ -107,7 +108,7 @@ def match_to_walls(
     some = scans[:: -(-len(scans) // SAMPLE)]
     scale, spread = _noise(_Block(poses[some], covs[some], returns(some), walls, config))
     covs = scale[:, None] * covs * scale
-    config = replace(config, range_sigma_m=spread * config.range_sigma_m)
+    config = noisier(config, spread)
     made = []
     for begin in range(0, len(scans), BLOCK):
         own = scans[begin : begin + BLOCK]
@@ -251,7 +252,7 @@ class _Block:
     ) -> OnWalls:
         scan, config = self._scan, self._config
         if spread != 1.0:
-            config = replace(config, range_sigma_m=spread * config.range_sigma_m)
+            config = noisier(config, spread)
         return returns_on_walls(
             self._near, world, transform_each(poses, self._lasers)[scan], self._walls, config,
             gate=gate, margin_m=0.0, heading_rad=heading_rad[scan], place_m=place_m[scan],

@@ -29,35 +29,32 @@ FALSE_BREAK = 0.03
 class Returns:
     """Moments of any run of returns: their sums up to each."""
 
-    def __init__(self, moments: Array) -> None:
-        """``moments`` (6, k): `point_moments` of all returns."""
+    def __init__(self, moments: Array, variance: Array | float) -> None:
+        """``moments`` (6, k): `point_moments` of all returns; ``variance`` (k,) of their ranges."""
         x, y = moments[1:3]
         each = np.vstack((moments, x * x, x * y, y * y))
-        each[6:] /= np.maximum(x * x + y * y, TINY)
+        each[6:] *= variance / np.maximum(x * x + y * y, TINY)
         self._each, self._sums = each, np.cumsum(each, axis=1)
 
     def of(self, first: Indices, last: Indices) -> Array:
         """Moments (6, p) of runs from ``first`` (p,) to ``last`` (p,), both included."""
         return np.asarray(self._sums[:6, last] - self._sums[:6, first] + self._each[:6, first])
 
-    def square_incidence(self, first: Indices, last: Indices) -> Array:
-        """Mean squared cosines (p,) of the angles at which the beams meet the lines of runs."""
+    def variance_across(self, first: Indices, last: Indices) -> Array:
+        """Mean variances (p,), m², of returns across the lines of runs, by noise of the ranges."""
         nn = fitted_lines(self.of(first, last))[3:]  # a², 2ab, b² of the normals (a, b)
         beams = self._sums[6:, last] - self._sums[6:, first] + self._each[6:, first]
         return np.asarray((nn * beams).sum(axis=0) / (last - first + 1))
 
-    def allowed_gain(
-        self, first: Indices, last: Indices, sigma_m: float, least_sigma_m: float
-    ) -> Array:
+    def allowed_gain(self, first: Indices, last: Indices, least_sigma_m: float) -> Array:
         """By how much (p,), m², noise makes two lines fit runs better than one does, at most.
 
         Args:
             first: (p,) first return of each run.
             last: (p,) last, included.
-            sigma_m: white noise of a range.
             least_sigma_m: least noise of a return across a wall that beams graze.
         """
-        across = sigma_m**2 * self.square_incidence(first, last)
+        across = self.variance_across(first, last)
         # chi-square with two degrees of freedom at each place
         gate = -2.0 * np.log(FALSE_BREAK / np.maximum(last - first, 1))
         return np.asarray(gate * np.maximum(across, max(least_sigma_m, LEAST_SIGMA_M) ** 2))
@@ -89,7 +86,7 @@ class Returns:
 
 
 def without_breaks(
-    returns: Returns, first: Indices, last: Indices, sigma_m: float, least_sigma_m: float
+    returns: Returns, first: Indices, last: Indices, least_sigma_m: float
 ) -> tuple[Indices, Indices]:
     """Runs cut wherever they break: ``first`` and ``last`` (q,) of each.
 
@@ -98,7 +95,7 @@ def without_breaks(
     done_first, done_last = [first[:0]], [last[:0]]
     while len(first):
         at, gain = returns.best_break(first, last)
-        cut = gain > returns.allowed_gain(first, last, sigma_m, least_sigma_m)
+        cut = gain > returns.allowed_gain(first, last, least_sigma_m)
         done_first.append(first[~cut])
         done_last.append(last[~cut])
         a, k, b = first[cut], at[cut], last[cut]

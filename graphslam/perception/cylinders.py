@@ -16,8 +16,9 @@ from scipy.special import chdtri
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.records import Observation
-from graphslam.perception.line_moments import fitted_lines, mean_square
+from graphslam.perception.line_moments import fitted_lines, mean_square, mean_square_range
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
+from graphslam.perception.range_noise import range_variance
 from graphslam.perception.segments import MISSING_BEAMS
 
 ITERATIONS = 3
@@ -108,7 +109,7 @@ def fit_circles(sweep: Sweep, first: Indices, last: Indices, config: FrontEndCon
     """Weighted least squares of circles from ranges and edges, by Gauss-Newton.
 
     The range of a beam that hits the circle is rho cos(delta) - sqrt(R² - rho² sin²(delta)), with
-    noise ``range_sigma_m`` along the beam. The circle's edges, beta ± asin(R / rho), lie between
+    noise of the range along the beam. The circle's edges, beta ± asin(R / rho), lie between
     the last beam that hit it and the next: half a beam beyond, with a sigma of one beam. The
     returns of each circle are those from row ``first`` (m,) to ``last`` (m,), inclusive.
     """
@@ -127,19 +128,19 @@ def fit_circles(sweep: Sweep, first: Indices, last: Indices, config: FrontEndCon
     R = nearest * half_width / (1 - half_width)
     state = np.array(((low + high) / 2, nearest + R, R)).T
     edges = np.array((low, high)).T
-    sigma, edge_sigma = config.range_sigma_m, sweep.step_rad
+    variance, edge_sigma = range_variance(config, r * r), sweep.step_rad
     for round_ in range(2):
         for _ in range(ITERATIONS):
-            e, J, w = _residuals(state, r, phi, used, edges, sigma, edge_sigma)
+            e, J, w = _residuals(state, r, phi, used, edges, variance, edge_sigma)
             N = np.einsum("mni,mn,mnj->mij", J, w, J) + DAMPING * np.eye(3)
             step = np.linalg.solve(N, np.einsum("mni,mn,mn->mi", J, w, e)[..., None])[..., 0]
             R = np.clip(state[:, 2] + step[:, 2], 0.5 * state[:, 2], 2 * state[:, 2])
             rho = np.maximum(state[:, 1] + step[:, 1], nearest + 0.2 * R)
             state = np.array((state[:, 0] + step[:, 0], rho, R)).T
-        e, J, w = _residuals(state, r, phi, used, edges, sigma, edge_sigma)
+        e, J, w = _residuals(state, r, phi, used, edges, variance, edge_sigma)
         if round_ == 0:
             ends = (column == 0) | (column == counts[:, None] - 1)
-            used &= ~(ends & (np.abs(e[:, :-2]) > OUTLIER_SIGMAS * sigma))
+            used &= ~(ends & (np.abs(e[:, :-2]) > OUTLIER_SIGMAS * np.sqrt(variance)))
     N = np.einsum("mni,mn,mnj->mij", J, w, J) + DAMPING * np.eye(3)
     square = w * e * e
     state[:, 0] = wrap(state[:, 0])
@@ -153,7 +154,13 @@ def fit_circles(sweep: Sweep, first: Indices, last: Indices, config: FrontEndCon
 
 
 def _residuals(
-    state: Array, r: Array, phi: Array, used: Mask, edges: Array, sigma: float, edge_sigma: float
+    state: Array,
+    r: Array,
+    phi: Array,
+    used: Mask,
+    edges: Array,
+    variance: Array | float,
+    edge_sigma: float,
 ) -> tuple[Array, Array, Array]:
     """Residuals (m, n + 2), measured minus predicted, derivatives (m, n + 2, 3), weights."""
     beta, rho, R = state.T[:, :, None]
@@ -174,7 +181,7 @@ def _residuals(
     expected = beta + half_width[:, None] * np.array((-1.0, 1.0))
     e = np.concatenate((r - (rho * c - root), wrap(edges - expected)), axis=1)
     w = np.full(e.shape, edge_sigma**-2)
-    w[:, :-2] = (used & (under > (GRAZING * R) ** 2)) / sigma**2
+    w[:, :-2] = (used & (under > (GRAZING * R) ** 2)) / variance
     return e, J, w
 
 
@@ -182,4 +189,5 @@ def _line_chi2(sweep: Sweep, first: Indices, last: Indices, config: FrontEndConf
     """(m,) chi-square of straight lines through the same returns."""
     sums = np.cumsum(sweep.moments, axis=1)
     M = sums[:, last] - np.where(first > 0, sums[:, first - 1], 0.0)
-    return np.asarray(M[0] * mean_square(fitted_lines(M), M) / config.range_sigma_m**2)
+    variance = range_variance(config, mean_square_range(M))
+    return np.asarray(M[0] * mean_square(fitted_lines(M), M) / variance)

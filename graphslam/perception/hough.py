@@ -19,8 +19,14 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
 from graphslam.perception.hough_votes import HOUGH_VOTES, SEED_POINTS
 from graphslam.perception.line_fit import fit_lines, observations
-from graphslam.perception.line_moments import fitted_line, fitted_lines, mean_square
+from graphslam.perception.line_moments import (
+    fitted_line,
+    fitted_lines,
+    mean_square,
+    mean_square_range,
+)
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
+from graphslam.perception.range_noise import largest_deviation, range_variance
 from graphslam.perception.segments import MISSING_BEAMS, allowed_rms, fewest_points, valid_lines
 
 RUN_POINTS = 3
@@ -90,10 +96,11 @@ def find_lines(sweep: Sweep, free: Mask, config: FrontEndConfig) -> tuple[Indice
 def _grow(seed: Indices, sweep: Sweep, free: Mask, config: FrontEndConfig) -> Indices:
     """Rows of the returns of the line that grows from a seed, in the order of the beams."""
     rows = seed
+    reach_sq = largest_deviation(config, mean_square_range(sweep.moments)) ** 2
     for _ in range(ROUNDS):
         before = rows
         line, direction = fitted_line(sweep.moments[:, before].sum(axis=1))
-        rows = np.flatnonzero((line @ sweep.moments <= config.split_m**2) & free)
+        rows = np.flatnonzero((line @ sweep.moments <= reach_sq) & free)
         rows = _fitting_runs(rows, line, direction, sweep, config)
         if len(rows) < SEED_POINTS or np.array_equal(rows, before):
             break
@@ -128,7 +135,7 @@ def _fit(rows: Indices, starts: Indices, line: Array, sweep: Sweep, config: Fron
     """Which parts of ``rows`` lie on the line; ``starts`` may hold several divisions."""
     r = sweep.ranges[sweep.beam[rows]]
     # along the normal; line[0] is the squared offset, so the factor is cos² of the incidence
-    var = config.range_sigma_m**2 * line[0] / (r * r)
+    var = range_variance(config, r * r) * line[0] / (r * r)
     sums = np.cumsum(np.concatenate((sweep.moments[:, rows], var[None])), axis=1)
     stops = np.append(starts[1:], 0)
     stops[stops == 0] = len(rows)  # the last part of each division
@@ -136,7 +143,8 @@ def _fit(rows: Indices, starts: Indices, line: Array, sweep: Sweep, config: Fron
     M[:, starts > 0] -= sums[:, starts[starts > 0] - 1]
     M, noise = M[:-1], M[-1] / M[0]
     excess = mean_square(line[:, None], M) - mean_square(fitted_lines(M), M)
-    good = excess <= FLATNESS * allowed_rms(config) ** 2 + RUN_GATE * noise / M[0]
+    flat = FLATNESS * allowed_rms(config, mean_square_range(M)) ** 2
+    good = excess <= flat + RUN_GATE * noise / M[0]
     return np.asarray(good & (M[0] >= RUN_POINTS))
 
 

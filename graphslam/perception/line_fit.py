@@ -14,6 +14,7 @@ from graphslam.core.geometry import Array, rotation3, wrap
 from graphslam.core.observation_arrays import LINE, SEGMENT, ObservationArrays
 from graphslam.core.records import Observation
 from graphslam.perception.ordered_scan import Indices, Mask
+from graphslam.perception.range_noise import range_variance
 
 SMALLEST_SIGMA_M = 1e-4
 """Floor of one point's normal noise where the settings have none: weights stay finite."""
@@ -45,11 +46,10 @@ def fit_lines(points: Array, starts: Indices, config: FrontEndConfig) -> LineFit
     """Weighted total least squares of m lines, thesis 4.7.6 and eq. 4.32, 4.36-4.38.
 
     With ``config.covariance == "incidence"`` a point weighs 1/sigma_n², its own noise along the
-    normal: range noise acts along the beam, so sigma_n = range_sigma_m |cos(incidence)|, and not
-    less than floor_normal_m, as the material's bias does not vanish at grazing incidence. The
-    cosine is computed from the beam's direction, which has no noise: one from the measured range
-    would correlate weight and error. With ``"thesis"`` every point weighs
-    1/range_sigma_m², as in eq. 4.32.
+    normal: range noise acts along the beam, so sigma_n = sigma_r |cos(incidence)|, and not less
+    than floor_normal_m, as the material's bias does not vanish at grazing incidence. The cosine is
+    computed from the beam's direction, which has no noise: one from the measured range would
+    correlate weight and error. With ``"thesis"`` every point weighs 1/sigma_r², as in eq. 4.32.
 
     ``points`` (k, 2), m, laser frame, are those of one line after the other, each line's in the
     order of the beams (either way round) and from its row in ``starts`` (m,) on.
@@ -60,12 +60,13 @@ def fit_lines(points: Array, starts: Indices, config: FrontEndConfig) -> LineFit
     counts = np.diff(starts, append=len(points))
     line = np.repeat(np.arange(len(starts)), counts)
     x, y = points.T
-    weight = np.full(len(points), max(config.range_sigma_m, SMALLEST_SIGMA_M) ** -2)
+    sigma_r = np.sqrt(range_variance(config, x * x + y * y))
+    weight = np.broadcast_to(np.maximum(sigma_r, SMALLEST_SIGMA_M) ** -2, len(points))
     cx, cy, direction = _total_least_squares(x, y, weight, starts, line)
     if config.covariance == "incidence":
         from_normal = np.cos(direction)[line] * y - np.sin(direction)[line] * x
         floor = max(config.floor_normal_m, SMALLEST_SIGMA_M)
-        sigma = np.maximum(config.range_sigma_m * np.abs(from_normal) / np.hypot(x, y), floor)
+        sigma = np.maximum(sigma_r * np.abs(from_normal) / np.hypot(x, y), floor)
         weight = sigma**-2
         cx, cy, direction = _total_least_squares(x, y, weight, starts, line)
     # the line's left is (-sin, cos): the sensor is there if the line's own offset is negative

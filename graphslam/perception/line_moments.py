@@ -51,6 +51,11 @@ def mean_square(lines: Array, moments: Array) -> Array:
     return np.asarray((lines * moments).sum(axis=0) / moments[0])
 
 
+def mean_square_range(moments: Array) -> Array:
+    """Mean squares (p,), m², of the ranges of returns with ``moments`` (6, p)."""
+    return np.asarray((moments[3] + moments[5]) / moments[0])
+
+
 def least_squares(moments: Array) -> Array:
     """Sums (p,), m², of squared deviations of returns with ``moments`` (6, p) from their lines."""
     n, x, y, xx, xy, yy = moments

@@ -18,6 +18,7 @@ from scipy.special import chdtri
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, polar_points, rotation, unit_vectors, wrap
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
+from graphslam.perception.range_noise import range_variance
 
 #: m, beams, m: returns farther apart are not of one free-standing object: a distance, as many times
 #: the distance between beams if that is more (a side at grazing incidence), and an upper limit
@@ -203,7 +204,8 @@ def fit_outline(
     """
     beam = sweep.beam[first : last + 1]
     edges, sigma = _edges_seen(sweep, first, last)
-    w = np.concatenate([np.full(len(beam), config.range_sigma_m**-2), unoccluded * sigma**-2])
+    variance = range_variance(config, sweep.ranges[beam] ** 2)
+    w = np.concatenate([np.broadcast_to(1 / variance, len(beam)), unoccluded * sigma**-2])
     w[[0, len(beam) - 1]] = MIXED_M**-2
     view = _ClusterView(outline, sweep.angles[beam], sweep.ranges[beam], edges, w)
     fixed = _levenberg_marquardt(_initial_pose(view, expected), 2, view)

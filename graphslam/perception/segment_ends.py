@@ -11,6 +11,7 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, wrap
 from graphslam.perception.line_fit import LineFits
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
+from graphslam.perception.range_noise import largest_deviation
 
 BEAMS_BESIDE = 2
 """Beams beyond an end that are tested: the first may be a mixed pixel of an occluding edge."""
@@ -44,7 +45,7 @@ def _corner_m(r: Array, sweep: Sweep, config: FrontEndConfig) -> Array:
 
     Twice the distance between beams there, as the second wall may be seen at 60° incidence.
     """
-    return 2 * (config.split_m + r * sweep.step_rad)
+    return np.asarray(2 * (largest_deviation(config, r * r) + r * sweep.step_rad))
 
 
 def _ends_real(sweep: Sweep, ends: Indices, fits: LineFits, config: FrontEndConfig) -> Mask:
@@ -64,6 +65,6 @@ def _ends_real(sweep: Sweep, ends: Indices, fits: LineFits, config: FrontEndConf
     from_line = after * np.sin(sweep.angles[beams[..., 1:]] - direction) - offset
     end = r[..., :1]
     far = np.abs(after - end) > config.gap_m + config.gap_ratio * end
-    goes_on = far & (np.abs(from_line) < 2 * config.split_m)
+    goes_on = far & (np.abs(from_line) < 2 * largest_deviation(config, after * after))
     cut = np.isnan(after) | occluded | goes_on
     return np.asarray(~cut.any(axis=(0, 2)))

@@ -17,8 +17,9 @@ from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
 from graphslam.perception.breaks import Returns, moved_breaks, without_breaks
 from graphslam.perception.line_fit import LineFits, fit_lines, observations
-from graphslam.perception.line_moments import fitted_lines, mean_square
+from graphslam.perception.line_moments import fitted_lines, mean_square, mean_square_range
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
+from graphslam.perception.range_noise import largest_deviation, range_variance
 from graphslam.perception.segment_ends import fully_visible
 from graphslam.perception.variance_split import first_and_last, split_by_variance
 
@@ -77,7 +78,7 @@ def segments(sweep: Sweep, config: FrontEndConfig) -> tuple[Observation, ...]:
 
 def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments:
     """The segments of one scan with their returns."""
-    returns = Returns(sweep.moments)
+    returns = _returns(sweep.moments, config)
     split = _split_scans if config.split_rule == "variance" else _split
     pieces = split(sweep, returns, config)
     # Twice: an object in front of a wall keeps the parts of the wall from being neighbours, and can
@@ -99,7 +100,10 @@ def find_segments(sweep: Sweep, config: FrontEndConfig) -> Segments:
 
 def valid_lines(fits: LineFits, config: FrontEndConfig) -> Mask:
     """(m,) True where a line is long enough and its points scatter no more than allowed."""
-    return (fits.length >= config.min_length_m) & (fits.rms <= allowed_rms(config))
+    # points that are spread evenly
+    square_range = (fits.z[:, :2] ** 2).sum(axis=1) + fits.length**2 / 12
+    straight = fits.rms <= allowed_rms(config, square_range)
+    return np.asarray((fits.length >= config.min_length_m) & straight)
 
 
 def fewest_points(config: FrontEndConfig) -> int:
@@ -107,9 +111,17 @@ def fewest_points(config: FrontEndConfig) -> int:
     return max(config.min_points, 4)
 
 
-def allowed_rms(config: FrontEndConfig) -> float:
-    """Largest root mean square deviation from a line, m: half of the largest deviation, split_m."""
-    return max(config.split_m, 1e-4) / 2  # a divisor; and rounding errors must pass
+def allowed_rms(config: FrontEndConfig, square_ranges: Array) -> Array | float:
+    """Largest root mean square deviations (p,) from lines, m: half of the largest deviations.
+
+    ``square_ranges`` (p,), m²: the means of the returns of each.
+    """
+    # a divisor; and rounding errors must pass
+    return np.asarray(np.maximum(largest_deviation(config, square_ranges), 1e-4) / 2)
+
+
+def _returns(moments: Array, config: FrontEndConfig) -> Returns:
+    return Returns(moments, range_variance(config, mean_square_range(moments)))
 
 
 def _misfit(pieces: Array, unions: Array, config: FrontEndConfig) -> Array:
@@ -127,12 +139,12 @@ def _misfit(pieces: Array, unions: Array, config: FrontEndConfig) -> Array:
     lines = fitted_lines(everything)
     own = mean_square(lines, everything)
     line = lines[:, p:]
-    rms_sq = allowed_rms(config) ** 2
+    rms_sq = allowed_rms(config, mean_square_range(unions)) ** 2
     misfit = own[p:] / (rms_sq * (1 + 2 * np.sqrt(2 / unions[0])))
-    allowed = rms_sq / 4 + MERGE_GATE * config.range_sigma_m**2 / pieces[0]
+    allowed = MERGE_GATE * range_variance(config, mean_square_range(pieces)) / pieces[0]
     for side in (slice(None, -1), slice(1, None)):
         excess = mean_square(line, pieces[:, side]) - own[:p][side]
-        misfit = np.maximum(misfit, excess / allowed[side])
+        misfit = np.maximum(misfit, excess / (rms_sq / 4 + allowed[side]))
     return np.asarray(misfit)
 
 
@@ -150,8 +162,9 @@ def _chain_starts(sweep: Sweep, config: FrontEndConfig) -> Indices:
     aside = np.abs(dx[:-1] * dy[1:] - dy[:-1] * dx[1:])  # deviation from collinear, times the base
     ahead = dx[:-1] * dx[1:] + dy[:-1] * dy[1:] > 0
     into, out_of = length[:-1], length[1:]
-    cut[1:] &= ~(ahead & (aside < config.split_m * into) & (out_of < STEP_GROWTH * into))
-    cut[:-1] &= ~(ahead & (aside < config.split_m * out_of) & (into < STEP_GROWTH * out_of))
+    off = largest_deviation(config, x[1:-1] ** 2 + y[1:-1] ** 2)
+    cut[1:] &= ~(ahead & (aside < off * into) & (out_of < STEP_GROWTH * into))
+    cut[:-1] &= ~(ahead & (aside < off * out_of) & (into < STEP_GROWTH * out_of))
     cut |= sweep.beam[1:] - sweep.beam[:-1] > MISSING_BEAMS + 1
     cut |= sweep.scan[1:] != sweep.scan[:-1]
     return np.concatenate(([0], np.flatnonzero(cut) + 1))
@@ -172,10 +185,13 @@ def _split(sweep: Sweep, returns: Returns, config: FrontEndConfig) -> Pieces:
     starts = _chain_starts(sweep, config)
     stops = np.append(starts[1:], len(sweep.beam))
     points = sweep.points.astype(np.float32)
+    sums = np.concatenate(([0.0], np.cumsum(sweep.moments[3] + sweep.moments[5])))
+    squares = (sums[stops] - sums[starts]) / np.maximum(stops - starts, 1)
+    off = np.broadcast_to(largest_deviation(config, squares), len(starts))
     # OpenCV 5.0.0 returns (n, 1, 2), other 5.x builds (n, 2)
     chains = [
-        cv2.approxPolyDP(points[i:j], config.split_m, False).reshape(-1, 2)
-        for i, j in zip(starts.tolist(), stops.tolist(), strict=True)
+        cv2.approxPolyDP(points[i:j], most, False).reshape(-1, 2)
+        for i, j, most in zip(starts.tolist(), stops.tolist(), off.tolist(), strict=True)
         if j - i >= 3
     ]
     if not chains:
@@ -199,12 +215,11 @@ def _split_scans(sweep: Sweep, returns: Returns, config: FrontEndConfig) -> Piec
     """Pieces by the variance of the deviations, beginning with whole scans: 4.7.6 as printed."""
     starts = np.flatnonzero(np.diff(sweep.scan, prepend=-1))
     ends = np.append(starts[1:], len(sweep.scan)) - 1
+    most_rms = max(config.split_m, 1e-4) / 2  # whatever the noise is
     runs = [
         run
         for i, j in zip(starts.tolist(), ends.tolist(), strict=True)
-        for run in split_by_variance(
-            sweep.points, i, j, allowed_rms(config) ** 2, fewest_points(config)
-        )
+        for run in split_by_variance(sweep.points, i, j, most_rms**2, fewest_points(config))
     ]
     return _pieces(returns, *first_and_last(runs))
 
@@ -251,7 +266,8 @@ def _bridged(pieces: Pieces, i: int, sweep: Sweep, config: FrontEndConfig) -> bo
     r, angle = sweep.ranges[between], sweep.angles[between]
     wall = math.atan2(b1[1] - a0[1], b1[0] - a0[0])
     left = r * np.sin(angle - wall) - (a0[1] * math.cos(wall) - a0[0] * math.sin(wall))
-    return not np.any(left < -2 * config.split_m)  # missing returns, NaN, compare False
+    # missing returns, NaN, compare False
+    return not np.any(left < -2 * largest_deviation(config, r * r))
 
 
 def _members(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> tuple[Indices, Indices, Mask]:
@@ -269,34 +285,41 @@ def _members(pieces: Pieces, sweep: Sweep, config: FrontEndConfig) -> tuple[Indi
     rows = np.arange(counts.sum()) + np.repeat(pieces.first + counts - np.cumsum(counts), counts)
     own = pieces.moments - moments[:, pieces.first] - moments[:, pieces.last]
     # what lies in front of a wall or behind it breaks no line; what bends it is not left out yet
-    rows, counts = _near(rows, counts, own, BENDS * config.split_m, moments)
-    returns = Returns(moments[:, rows])
+    rows, counts = _near(rows, counts, own, BENDS, moments, config)
+    returns = _returns(moments[:, rows], config)
     last = np.cumsum(counts) - 1
-    noise = config.range_sigma_m, config.floor_normal_m
     begin, end = last - counts + 1, last
     first = begin
     if config.split_rule != "variance":  # that one is used as the thesis prints it
-        first, last = without_breaks(returns, begin, end, *noise)
+        first, last = without_breaks(returns, begin, end, config.floor_normal_m)
     unbroken = np.isin(first, begin) & np.isin(last, end)
     size = last - first + 1
     enough = size >= fewest_points(config)
     rows, counts = rows[np.repeat(enough, size)], size[enough]
     first, last, unbroken = first[enough], last[enough], unbroken[enough]
-    rows, counts = _near(rows, counts, returns.of(first + 1, last - 1), config.split_m, moments)
+    fitted = returns.of(first + 1, last - 1)
+    rows, counts = _near(rows, counts, fitted, 1.0, moments, config)
     enough = counts >= fewest_points(config)
     return rows[np.repeat(enough, counts)], counts[enough], unbroken[enough]
 
 
 def _near(
-    rows: Indices, counts: Indices, fitted: Array, reach_m: float, moments: Array
+    rows: Indices,
+    counts: Indices,
+    fitted: Array,
+    deviations: float,
+    moments: Array,
+    config: FrontEndConfig,
 ) -> tuple[Indices, Indices]:
     """Of runs of ``rows``, ``counts`` (m,) each, those near the lines that ``fitted`` (6, m) have.
 
+    ``deviations``: how near, in largest deviations of a return of a line.
     A row in two neighbouring runs stays in that with the closer line.
     """
     owner = np.repeat(np.arange(len(counts)), counts)
-    square = (fitted_lines(fitted)[:, owner] * moments[:, rows]).sum(axis=0)
-    near = square <= reach_m**2
+    each = moments[:, rows]
+    square = (fitted_lines(fitted)[:, owner] * each).sum(axis=0)
+    near = square <= (deviations * largest_deviation(config, mean_square_range(each))) ** 2
     shared = np.flatnonzero(rows[1:] == rows[:-1])
     near[np.where(square[shared] <= square[shared + 1], shared + 1, shared)] = False
     return rows[near], np.bincount(owner[near], minlength=len(counts))

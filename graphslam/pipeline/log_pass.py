@@ -24,7 +24,7 @@ from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.interpolation import FrameTransforms
 from graphslam.pipeline.progress import Progress, counted, timed
 from graphslam.pipeline.recorded_closures import RecordedClosures
-from graphslam.pipeline.robot_settings import make_tracks, with_noted_keyframes
+from graphslam.pipeline.robot_settings import make_tracks, with_log_settings
 from graphslam.pipeline.robot_state import RobotState
 from graphslam.pipeline.scan_evidence import Parked
 from graphslam.pipeline.scans_since_keyframe import ScansSinceKeyframe
@@ -62,9 +62,9 @@ class LogPass:
     """
 
     def __init__(self, log: LogSet, config: Config, known: PriorKnowledge) -> None:
-        """Without states; keyframe settings noted in the log replace defaults of ``config``."""
+        """Without states; what the log says replaces defaults of ``config``."""
         self.given_config = config
-        config = with_noted_keyframes(log, config)
+        config = with_log_settings(log, config)
         self.log, self.config, self.known = log, config, known
         self.runs = {
             name: RobotState(

@@ -3,9 +3,16 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import attrgetter
 from typing import TypeVar
 
-from graphslam.core.config import Config, KeyframeConfig, OdometryConfig, RobotConfig
+from graphslam.core.config import (
+    Config,
+    FrontEndConfig,
+    KeyframeConfig,
+    OdometryConfig,
+    RobotConfig,
+)
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import ConfigError
 from graphslam.core.geometry import Array
@@ -17,6 +24,10 @@ from graphslam.odometry.noise_estimation import rates_of
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.several_lasers import SeveralLasersTrack
 from graphslam.perception.robot_outlines import outline_of
+
+#: by how much lasers are noisier than the default where that is taken into account. ACES has 1.4,
+#: and equal errors with and without
+LEAST_NOISE = 1.5
 
 Settings = TypeVar("Settings", KeyframeConfig, OdometryConfig, RobotConfig)
 
@@ -33,9 +44,30 @@ def check_robots(log: LogSet, config: Config) -> None:
             raise ConfigError(f"robots.{name}: the log has no robot {name}, but {known}")
 
 
-def with_noted_keyframes(log: LogSet, config: Config) -> Config:
-    """The configuration; keyframe settings noted in the log replace its defaults."""
-    return replace(config, keyframe=noted(config.keyframe, "keyframe", log.notes))
+def with_log_settings(log: LogSet, config: Config) -> Config:
+    """The configuration with what the log says in place of defaults.
+
+    That are noted keyframe settings, and the noise of the noisiest laser.
+    """
+    return replace(
+        config,
+        keyframe=noted(config.keyframe, "keyframe", log.notes),
+        front_end=with_range_noise(log, config.front_end),
+    )
+
+
+def with_range_noise(log: LogSet, config: FrontEndConfig) -> FrontEndConfig:
+    """The settings with the noise of ranges that is measured, where that is larger by far."""
+    default = FrontEndConfig()
+    told = config.range_sigma_m, config.range_sigma_ratio
+    if told != (default.range_sigma_m, default.range_sigma_ratio):
+        return config
+    of_lasers = [log.range_noise(topic.name) for topic in log.topics if topic.record is Scan]
+    noise = max(filter(None, of_lasers), key=attrgetter("largest_m"), default=None)
+    if noise is None or noise.largest_m < LEAST_NOISE * default.range_sigma_m:
+        return config
+    sigma_m = max(noise.sigma_m, default.range_sigma_m)
+    return replace(config, range_sigma_m=sigma_m, range_sigma_ratio=noise.ratio)
 
 
 def make_tracks(log: LogSet, config: Config) -> dict[str, Track]:

@@ -40,7 +40,7 @@ from graphslam.perception.front_ends import observe_block
 from graphslam.perception.ordered_scan import Sweep, make_sweep, scan_points
 from graphslam.pipeline.keyframes import KeyframeSelector
 from graphslam.pipeline.progress import counted, timed
-from graphslam.pipeline.robot_settings import make_tracks, with_noted_keyframes
+from graphslam.pipeline.robot_settings import make_tracks, with_log_settings
 from graphslam.pipeline.robot_state import RobotState
 from graphslam.pipeline.scans_between import are_matched
 from graphslam.pipeline.synchronisation import synchronise
@@ -118,7 +118,7 @@ def read_keyframes(
     blocks it is waited for: before, some of what follows is read, then comes a `AwaitCalibration`.
     ``known``: what is sent before the first block, with its prior.
     """
-    reader = _Reader(log, with_noted_keyframes(log, config), log.robots[0], known)
+    reader = _Reader(log, with_log_settings(log, config), log.robots[0], known)
     for number, block in enumerate(reader.blocks(), 1):
         found = yield block
         if number == uncalibrated:

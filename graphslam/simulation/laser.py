@@ -84,7 +84,9 @@ def noisy_ranges(hits: Hits, biases: Array, laser: Laser, rng: np.random.Generat
     """
     clean, shape = hits.ranges, hits.ranges.shape
     bias = np.where(hits.surfaces == NO_SURFACE, 0.0, np.append(biases, 0.0)[hits.surfaces])
-    ranges = clean + bias + laser.range_sigma_m * rng.normal(size=shape)
+    far = np.where(np.isfinite(clean), clean, 0.0)
+    sigma = np.hypot(laser.range_sigma_m, laser.range_sigma_ratio * far)
+    ranges = clean + bias + sigma * rng.normal(size=shape)
     ranges = _mixed_pixels(ranges, hits, laser, rng)
     spurious = rng.random(shape) < laser.spurious_share
     farthest = np.minimum(np.where(np.isfinite(clean), clean, np.inf), laser.range_max_m)

@@ -195,9 +195,11 @@ class Laser(Sensor):
     """A planar laser like the SICK LMS 200; beams from -field/2 to +field/2.
 
     mount_m, mount_deg: its pose in the base frame; mount_error_m, mount_error_deg: what the
-    transform in the log adds to it, along the axes of the base. range_sigma_m: white noise.
-    bias_sigma_m: sigma of the constant range bias of a material. dropout_share: share of beams
-    without a return; spurious_share: with a return from a random range in front of the surface.
+    transform in the log adds to it, along the axes of the base. range_sigma_m: white noise;
+    range_sigma_ratio: more of it, as a share of the range (the root of the sum of their squares
+    counts). bias_sigma_m: sigma of the constant range bias of a material. dropout_share: share of
+    beams without a return; spurious_share: with a return from a random range in front of the
+    surface.
     mixed_share: share of the beams at a range discontinuity above mixed_gap_m that return a range
     between its two sides.
     resolution_m: ranges are rounded to multiples of it; 0 = not rounded. sweep_s: time from the
@@ -214,6 +216,7 @@ class Laser(Sensor):
     mount_error_m: Point = (0.0, 0.0)
     mount_error_deg: float = 0.0
     range_sigma_m: float = field(default=0.015, metadata=NOT_NEGATIVE)
+    range_sigma_ratio: float = field(default=0.0, metadata=NOT_NEGATIVE)
     bias_sigma_m: float = field(default=0.01, metadata=NOT_NEGATIVE)
     dropout_share: float = field(default=0.0, metadata=SHARE)
     spurious_share: float = field(default=0.0, metadata=SHARE)

@@ -206,6 +206,7 @@ def lasers_used(log: LogSet, robot: str, run: RobotState) -> list[dict[str, Any]
             continue
         error, late_ns = run.track.laser(sensor)
         told, no_return_m = log.mount(topic), log.no_return_m(topic)
+        noise = log.range_noise(topic)
         lasers.append(
             {
                 "topic": topic,
@@ -214,6 +215,8 @@ def lasers_used(log: LogSet, robot: str, run: RobotState) -> list[dict[str, Any]
                 "mount_in_log": told.tolist(),
                 "latency_s": 1e-9 * late_ns,
                 "no_return_m": no_return_m if np.isfinite(no_return_m) else None,
+                "range_sigma_m": None if noise is None else noise.sigma_m,
+                "range_sigma_ratio": None if noise is None else noise.ratio,
             }
         )
     return lasers

@@ -16,8 +16,9 @@ def noisy(points, sigma, seed=0):
     )
 
 
-def whole(points):
-    return Returns(point_moments(points)), np.array([0]), np.array([len(points) - 1])
+def whole(points, sigma_m=0.02):
+    returns = Returns(point_moments(points), sigma_m**2)
+    return returns, np.array([0]), np.array([len(points) - 1])
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -38,7 +39,7 @@ def test_a_door_is_told_from_its_wall_from_afar(seed):
     is turned by 70 mrad, seven sigmas, from wherever the robot sees both."""
     x = np.arange(11) * 0.21
     points = noisy(np.column_stack([x, 12.0 + 0.11 * (x > 1.4)]), 0.015, seed)
-    first, _ = without_breaks(*whole(points), 0.02, 0.01)
+    first, _ = without_breaks(*whole(points), 0.01)
     assert list(first) == [0, 7]
 
 
@@ -49,7 +50,7 @@ def test_a_straight_run_is_not_broken_by_noise():
     broken = 0
     for seed in range(runs):
         points = noisy(np.column_stack([x, np.full_like(x, 2.0)]), 0.02, seed)
-        first, _ = without_breaks(*whole(points), 0.02, 0.02)
+        first, _ = without_breaks(*whole(points), 0.02)
         broken += len(first) > 1
     assert broken <= FALSE_BREAK * runs + 3 * np.sqrt(FALSE_BREAK * runs)
 
@@ -58,7 +59,7 @@ def test_a_straight_run_is_not_broken_by_noise():
 def test_a_step_is_found_where_it_is(step_m):
     x = np.linspace(0.0, 3.0, 100)
     points = noisy(np.column_stack([x, 2.0 + step_m * (x > 1.0)]), 0.01)
-    first, last = without_breaks(*whole(points), 0.02, 0.01)
+    first, last = without_breaks(*whole(points), 0.01)
     assert len(first) == 2
     assert abs(x[first[1]] - 1.0) < 0.05  # two returns
     assert last[0] + 1 == first[1]
@@ -71,7 +72,7 @@ def test_breaks_move_to_the_corner():
             np.column_stack([np.ones(30), np.linspace(0.03, 1, 30)]),
         ]
     )
-    returns = Returns(point_moments(corner))
+    returns = Returns(point_moments(corner), 0.02**2)
     for wrong in (25, 34):
         first, last = moved_breaks(returns, np.array([0, wrong]), np.array([wrong, 59]))
         assert last[0] == first[1]
@@ -80,6 +81,10 @@ def test_breaks_move_to_the_corner():
 
 def test_beams_that_graze_a_wall_have_less_noise_across_it():
     x = np.linspace(4.0, 6.0, 20)
-    grazing, _, _ = whole(np.column_stack([x, np.full_like(x, 0.5)]))
+    points = np.column_stack([x, np.full_like(x, 0.5)])
     ends = np.array([0]), np.array([19])
-    assert grazing.square_incidence(*ends) == pytest.approx(np.mean(0.25 / (x**2 + 0.25)))
+    square = 0.25 / (x**2 + 0.25)
+    even, _, _ = whole(points, 0.1)
+    assert even.variance_across(*ends) == pytest.approx(0.01 * np.mean(square))
+    growing = Returns(point_moments(points), 1e-4 * (x**2 + 0.25))
+    assert growing.variance_across(*ends) == pytest.approx(1e-4 * 0.25)

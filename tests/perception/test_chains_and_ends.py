@@ -170,7 +170,7 @@ def test_few_returns_may_scatter_more_than_a_segment(off_m, pieces):
     sign = np.array([1, -1, -1, 1] * 4)
     points = np.column_stack([3.0 + off_m * sign, 0.06 * (rows - 7.5)])
     sweep = sweep_of(points)
-    halves = Returns(sweep.moments).of(np.array([0, 8]), np.array([7, 15]))
+    halves = Returns(sweep.moments, 0.02**2).of(np.array([0, 8]), np.array([7, 15]))
     joined = _merge(Pieces(np.array([0, 8]), np.array([7, 15]), halves), sweep, CONFIG)
     assert len(joined.first) == pieces
 
@@ -362,8 +362,9 @@ def test_a_line_is_valid_up_to_its_limits():
     """`min_length_m`, 0.4 m, and half of `split_m` as root mean square deviation."""
     found = valid_lines(fits([0.39, 0.41, 0.41, 0.41], [0.0, 0.0, 0.024, 0.026]), CONFIG)
     assert found.tolist() == [False, True, True, False]
-    assert allowed_rms(CONFIG) == 0.025
-    assert allowed_rms(replace(CONFIG, split_m=0.0)) == 5e-5
+    assert allowed_rms(CONFIG, 9.0) == 0.025
+    assert allowed_rms(replace(CONFIG, split_m=0.0, range_sigma_m=0.0), 9.0) == 5e-5
+    assert allowed_rms(replace(CONFIG, range_sigma_m=0.1), 9.0) == pytest.approx(0.125)
     assert [fewest_points(replace(CONFIG, min_points=n)) for n in (1, 4, 9)] == [4, 4, 9]
 
 

@@ -176,17 +176,17 @@ def test_residuals_have_their_derivatives(rho, R, beta):
     r, used = np.full((1, 9), rho - R), np.ones((1, 9), dtype=bool)
 
     def predicted(state):
-        return -_residuals(state[None], r, phi, used, edges, 0.02, 0.01)[0][0]
+        return -_residuals(state[None], r, phi, used, edges, 0.02**2, 0.01)[0][0]
 
     at = np.array([beta, rho, R])
-    _, J, w = _residuals(at[None], r, phi, used, edges, 0.02, 0.01)
+    _, J, w = _residuals(at[None], r, phi, used, edges, 0.02**2, 0.01)
     np.testing.assert_allclose(J[0], jacobian(predicted, at), atol=1e-5)
     np.testing.assert_allclose(w[0], [0.02**-2] * 9 + [0.01**-2] * 2)
     # ranges and edges of the true circle leave nothing
     delta = wrap(phi[0] - beta)
     exact = rho * np.cos(delta) - np.sqrt(R**2 - (rho * np.sin(delta)) ** 2)
     edges = np.array([[beta - half, beta + half]])
-    e, _, _ = _residuals(at[None], exact[None], phi, used, edges, 0.02, 0.01)
+    e, _, _ = _residuals(at[None], exact[None], phi, used, edges, 0.02**2, 0.01)
     np.testing.assert_allclose(e, 0.0, atol=1e-12)
 
 
@@ -197,10 +197,10 @@ def test_beams_that_graze_or_miss_weigh_nothing_and_stay_finite():
     used = np.array([[True, True, True, True, False]])
     edges = np.array([[-0.1, 0.1]])
     state = np.array([[0.0, 3.0, 0.3]])
-    e, J, w = _residuals(state, np.full((1, 5), 2.7), phi, used, edges, 0.02, 0.01)
+    e, J, w = _residuals(state, np.full((1, 5), 2.7), phi, used, edges, 0.02**2, 0.01)
     np.testing.assert_array_equal(w[0, :-2] > 0, [False, True, False, True, False])
     for R in (0.99, 1.5):
-        e, J, w = _residuals(np.array([[0.0, 1.0, R]]), e[:, :-2], phi, used, edges, 0.02, 0.01)
+        e, J, w = _residuals(np.array([[0.0, 1.0, R]]), e[:, :-2], phi, used, edges, 0.02**2, 0.01)
         assert np.isfinite(e).all() and np.isfinite(J).all()
 
 

@@ -131,7 +131,7 @@ def test_parts_fit_a_line_by_their_excess_over_their_own_line():
             centred = own - own.mean(axis=0)
             least = max(np.linalg.eigvalsh(centred.T @ centred)[0], 0.0) / len(own)
             noise = np.mean((CONFIG.range_sigma_m * 4.0 / np.hypot(*own.T)) ** 2)
-            limit = FLATNESS * allowed_rms(CONFIG) ** 2 + RUN_GATE * noise / len(own)
+            limit = FLATNESS * allowed_rms(CONFIG, 16.0) ** 2 + RUN_GATE * noise / len(own)
             expected.append(bool(deviation - least <= limit and len(own) >= 3))
     assert found.tolist() == expected
     assert 0 < sum(expected) < len(expected)
