@@ -9,6 +9,8 @@ from graphslam.core.geometry import Array
 
 #: sigmas of the range that a return of a line may be off: one in eighty is farther out
 DEVIATION_SIGMAS = 2.5
+#: variance of ranges, m², that `split_m` allows for
+EXPECTED = FrontEndConfig.range_sigma_m**2
 
 
 def range_variance(config: FrontEndConfig, square_ranges: Array) -> Array | float:
@@ -20,14 +22,14 @@ def range_variance(config: FrontEndConfig, square_ranges: Array) -> Array | floa
 
 
 def largest_deviation(config: FrontEndConfig, square_ranges: Array) -> Array | float:
-    """How far returns (n,) may be off a line, m: ``split_m``, or more by noise of the range.
+    """How far returns (n,) may be off a line, m: ``split_m``, and what noise of the range adds.
 
     Args:
         config: of the front end.
         square_ranges: (n,) m², of the returns, or means of sets of them.
     """
-    noise = DEVIATION_SIGMAS * np.sqrt(range_variance(config, square_ranges))
-    return np.asarray(np.maximum(config.split_m, noise))
+    more = np.maximum(range_variance(config, square_ranges) - EXPECTED, 0.0)
+    return np.asarray(np.sqrt(config.split_m**2 + DEVIATION_SIGMAS**2 * more))
 
 
 def noisier(config: FrontEndConfig, factor: float) -> FrontEndConfig:
