@@ -72,6 +72,10 @@ class SightingProblem:
     kernel: RobustConfig
     begun_ns: Mapping[str, int]
 
+    def of_steps(self, steps: tuple[Step, ...]) -> "SightingProblem":
+        """The same of ``steps``, of which some associations may be left out."""
+        return replace(self, steps=steps)
+
     def solve(
         self, steps: Sequence[Step], start: Estimate, *, rough: bool = False
     ) -> tuple[Estimate, tuple[Step, ...]]:

@@ -40,6 +40,10 @@ class SteppedProblem:
     noise: LogNoise
     config: Config
 
+    def of_steps(self, steps: tuple[Step, ...]) -> "SteppedProblem":
+        """The same of ``steps``, of which some associations may be left out."""
+        return replace(self, steps=steps, groups=group_sightings(steps, self.sources))
+
     def solve(
         self, steps: Sequence[Step], start: Estimate, *, rough: bool = False
     ) -> tuple[Estimate, tuple[Step, ...]]:

@@ -14,6 +14,7 @@ from graphslam.core.records import Estimate, Step
 from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
 from graphslam.mapping.point_reassociation import PointSightings, is_point, reassociated
 from graphslam.pipeline.log_pass import LogPass
+from graphslam.sighting_smoothing.false_points import find_false_points
 from graphslam.sighting_smoothing.misplaced_landmarks import with_landmarks_placed_again
 from graphslam.sighting_smoothing.sensor_calibration import solved_with_sensors
 from graphslam.sighting_smoothing.sighting_noise import noise_of_pass
@@ -24,6 +25,8 @@ from graphslam.sighting_smoothing.state_per_step import SteppedProblem, sighting
 MAX_ROUNDS = 3
 #: share of the sightings that still move, below which another round is not worth it
 SETTLED_SHARE = 1e-3
+#: why sightings of `false_points` are not used
+HARDLY_EVER_SEEN = "a point that images hardly ever show where they should"
 
 
 def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Step, ...]]:
@@ -46,14 +49,21 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
         noise = noise_of_pass(one, start)
         problem, start = sighting_problem(one, start, noise)
         steps, start = _settled_associations(one, problem, start)
-        found = problem.finish(one, steps, start)
         targets = {a.source: a.target for step in steps for a in step.associations}
-        one.steps = list(_retargeted(one.steps, targets))
+        false = _false_points(one, problem, steps, start)
+        if false:
+            steps = _without_points(steps, false)
+            problem = problem.of_steps(steps)
+            left = {i: found for i, found in start.landmarks.items() if i not in false}
+            start = replace(start, landmarks=left)
+        found = problem.finish(one, steps, start)
+        one.steps = list(_without_points(_retargeted(one.steps, targets), false))
         return found
 
     found = solved_with_sensors(one, estimate, solve)
     estimate, solved = found.estimate, found.steps
     one.counts["landmarks_merged"] += before - len(estimate.landmarks)
+    one.counts["landmarks_merged"] -= one.counts["landmarks_removed"]
     landmarks.update_from(solved, estimate)
     _count_sightings(landmarks, solved, _unnamed_points(landmarks, estimate))
     return estimate, solved
@@ -70,7 +80,9 @@ def _settled_associations(
 ) -> tuple[tuple[Step, ...], Estimate]:
     """The steps of a problem with every sighting at the point that it fits, and their estimate."""
     points, steps = _unnamed_points(one.landmarks, estimate), problem.steps
-    for _ in range(MAX_ROUNDS if points else 0):
+    if not points:
+        return steps, estimate
+    for _ in range(MAX_ROUNDS):
         estimate, _ = problem.solve(steps, estimate, rough=True)
         steps, estimate, moved, count = _associated_again(problem, steps, estimate, points)
         one.counts["observations_reassociated"] += moved
@@ -103,6 +115,30 @@ def _associated_again(
     kept = {i: found for i, found in kept.items() if i in placed or i not in points}
     moved = int(np.count_nonzero(found != seen.target))
     return steps, replace(estimate, landmarks=kept), moved, len(found)
+
+
+def _false_points(
+    one: LogPass,
+    problem: SightingProblem | SteppedProblem,
+    steps: tuple[Step, ...],
+    estimate: Estimate,
+) -> set[int]:
+    """Points of an estimate that images hardly ever show; their sightings are counted."""
+    fine, there = problem.at_sightings(steps, estimate)
+    false = find_false_points(fine, there, _unnamed_points(one.landmarks, estimate))
+    of_these = [a for step in steps for a in step.associations if is_point(a, false)]
+    if false:
+        one.rejected[HARDLY_EVER_SEEN] += len(of_these)
+        one.counts["landmarks_removed"] += len(false)
+    return false
+
+
+def _without_points(steps: Sequence[Step], points: Collection[int]) -> tuple[Step, ...]:
+    """Steps without the sightings of some points."""
+    return tuple(
+        replace(step, associations=tuple(a for a in step.associations if not is_point(a, points)))
+        for step in steps
+    )
 
 
 def _retargeted(steps: Sequence[Step], targets: Mapping[int | None, int | str]) -> tuple[Step, ...]:

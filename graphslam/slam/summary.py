@@ -37,6 +37,7 @@ REOPTIMISED = (
     "closures_kept",
     "landmarks_merged",
     "landmarks_moved",
+    "landmarks_removed",
     "visits_displaced",
     "observations_reassociated",
     "observations_dropped",

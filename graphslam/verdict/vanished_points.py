@@ -9,16 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from graphslam.core.arrays import BoolArray, IntArray
-from graphslam.core.geometry import Array, between, polar_points, transform_each, wrap
+from graphslam.core.geometry import polar_points, transform_each
+from graphslam.mapping.points_in_sight import points_in_sight
 from graphslam.verdict.doubts import Reason, seconds
 from graphslam.verdict.evidence import Evidence, RobotEvidence
 
-#: share of the largest range in an image, and rad from its outermost bearings: what is within is in
-#: sight, since what is behind it or beside it is seen
-NEARER, MARGIN_RAD = 0.9, 0.05
 #: images that should show a point and do not, at least
 LEAST_IMAGES = 10
 #: share of the images with a point in sight that show it, at least: others are hardly seen anyway
@@ -69,7 +66,7 @@ def _visible(robot: RobotEvidence) -> _Visible:
     at = transform_each(poses, polar_points(z[:, 1], z[:, 0]))
     count = np.bincount(point, minlength=n)
     places = np.column_stack([np.bincount(point, w) for w in at.T]) / count[:, None]
-    pairs = _in_sight(places, poses[first], image, z)
+    pairs = points_in_sight(places, poses[first], image, z)
     shows = np.isin(pairs[:, 0] * n + pairs[:, 1], image * n + point)
     begin, end = np.full(n, m), np.zeros(n, dtype=np.int64)
     np.minimum.at(begin, point, image)
@@ -81,28 +78,3 @@ def _visible(robot: RobotEvidence) -> _Visible:
     known = count >= SHOWN * (count + meanwhile)
     many = [np.bincount(missed[which, 1], minlength=n) >= LEAST_IMAGES for which in (after, before)]
     return _Visible(many[0] & known, many[1] & known, times[first][end])
-
-
-def _in_sight(places: Array, poses: Array, image: IntArray, z: Array) -> IntArray:
-    """Pairs (k, 2) of image and point such that the image shows others behind and beside it.
-
-    ``places`` (n, 2) m are the points, ``poses`` (m, 3) those of the images; ``image`` (s,) and
-    ``z`` (s, 2), bearing rad and range m, are the sightings.
-    """
-    m = len(poses)
-    reach = np.zeros(m)
-    np.maximum.at(reach, image, NEARER * z[:, 1])
-    middle = np.arctan2(*(np.bincount(image, f(z[:, 0]), m) for f in (np.sin, np.cos)))
-    low, high = np.full(m, np.inf), np.full(m, -np.inf)
-    beside = wrap(z[:, 0] - middle[image])
-    np.minimum.at(low, image, beside + MARGIN_RAD)
-    np.maximum.at(high, image, beside - MARGIN_RAD)
-    near = cKDTree(places).query_ball_point(poses[:, :2], reach)
-    size = np.array([len(found) for found in near])
-    pairs = np.column_stack([
-        np.repeat(np.arange(m), size), np.concatenate([np.array(f, dtype=np.int64) for f in near])
-    ])  # fmt: skip
-    k = pairs[:, 0]
-    x, y = between(poses[k], np.column_stack([places[pairs[:, 1]], np.zeros(len(k))]))[:, :2].T
-    bearing = wrap(np.arctan2(y, x) - middle[k])
-    return np.asarray(pairs[(bearing > low[k]) & (bearing < high[k])])
