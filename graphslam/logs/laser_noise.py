@@ -48,14 +48,13 @@ class RangeNoise:
         return math.hypot(self.sigma_m, self.ratio * self.farthest_m)
 
 
-def find_range_noise(scans: Iterable[tuple[ArrayLike, float]]) -> RangeNoise | None:
+def find_range_noise(scans: Iterable[tuple[ArrayLike, ArrayLike]]) -> RangeNoise | None:
     """The noise of a laser; None if too few of its returns are of smooth surfaces.
 
     Args:
-        scans: ranges (n,) m, not finite or not positive without a return, and the angle between
-            beams, rad.
+        scans: ranges (n,) m, not finite or not positive without a return, and bearings (n,) rad.
     """
-    windows = [_windows(np.asarray(ranges, dtype=float), abs(step)) for ranges, step in scans]
+    windows = [_windows(*(np.asarray(v, dtype=float) for v in scan)) for scan in scans]
     if not windows:
         return None
     at, off = (np.concatenate(parts) for parts in zip(*windows, strict=True))
@@ -72,13 +71,16 @@ def find_range_noise(scans: Iterable[tuple[ArrayLike, float]]) -> RangeNoise | N
     return _fitted(*np.array(found).T) if found else None
 
 
-def _windows(ranges: Array, step_rad: float) -> tuple[Array, Array]:
+def _windows(ranges: Array, bearings: Array) -> tuple[Array, Array]:
     """Of windows of one scan in which all beams returned (k,): range and deviation, m."""
-    r = np.where(np.isfinite(ranges) & (ranges > 0), ranges, np.nan)
-    inverse = 1.0 / r
-    bend = inverse[:-2] + inverse[2:] - 2 * math.cos(step_rad) * inverse[1:-1]
-    # a range that is off by e changes its inverse by e / range²; the variances of the three add up
-    square = (bend * r[1:-1] ** 2) ** 2 / (2 + 4 * math.cos(step_rad) ** 2)
+    with np.errstate(all="ignore"):  # of angles that are none
+        r = np.where(np.isfinite(ranges) & (ranges > 0), ranges, np.nan)
+        step = np.sin(np.diff(bearings))
+        # a sinusoid through two beams, at the third: 0 on a wall, by these shares of the inverses
+        shares = np.array([step[1:], -np.sin(bearings[2:] - bearings[:-2]), step[:-1]])
+        three = np.array([r[:-2], r[1:-1], r[2:]])
+        # a range that is off by e changes its inverse by e / range²; the three variances add up
+        square = (shares / three).sum(axis=0) ** 2 / ((shares / three**2) ** 2).sum(axis=0)
     whole = max(len(square), 0) // WINDOW * WINDOW
     square = square[:whole].reshape(-1, WINDOW).mean(axis=1)
     at = np.sqrt((r[1 : whole + 1] ** 2).reshape(-1, WINDOW).mean(axis=1))

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from graphslam.core import records
 from graphslam.core.config import Config
@@ -227,10 +226,9 @@ class _SensorFrames:
             findings += odd_limits(topic.name, limits)
             no_return = find_no_return(message.ranges for message in messages)
             told["no_return_m"] = np.inf if no_return is None else no_return
-            told["range_noise"] = find_range_noise(
-                (np.where(_is_return(m, told["no_return_m"]), m.ranges, np.nan), m.angle_increment)
-                for m in messages
-            )
+        if is_scan:
+            swept = (_swept(topic, m, told.get("no_return_m", np.inf)) for m in messages)
+            told["range_noise"] = find_range_noise(scan for scan in swept if scan is not None)
         return told, findings
 
     def _base(self, topic: Topic, frame: str, tree: TransformTree) -> str:
@@ -241,10 +239,19 @@ class _SensorFrames:
         return self._bases.get(topic.robot, above)
 
 
-def _is_return(scan: Any, no_return_m: float) -> NDArray[np.bool_]:
-    """Which ranges (n,) of a message are measured."""
-    ranges = np.asarray(scan.ranges)
-    return np.asarray((ranges >= scan.range_min) & (ranges < min(scan.range_max, no_return_m)))
+def _swept(topic: Topic, message: Any, no_return_m: float) -> tuple[Array, Array] | None:
+    """Ranges (n,) m, NaN without a return, and bearings (n,) rad of a message of a laser."""
+    if topic.schema == schemas.POINT_CLOUD:
+        try:
+            points = cloud_points(message)
+        except ValueError:
+            return None
+        return sweep_of(points)[::-1] if len(points) else None
+    if topic.schema != schemas.LASER_SCAN:
+        return None
+    ranges = np.asarray(message.ranges, dtype=float)
+    fine = (ranges >= message.range_min) & (ranges < min(message.range_max, no_return_m))
+    return np.where(fine, ranges, np.nan), message.angle_increment * np.arange(len(ranges))
 
 
 def _one_laser(

@@ -35,7 +35,7 @@ def scans(sigma_m, share=0.0, number=60, seed=0, rough_m=0.0):
 
 
 def found(made):
-    return find_range_noise((ranges, STEP_RAD) for ranges in made)
+    return find_range_noise((ranges, STEP_RAD * np.arange(len(ranges))) for ranges in made)
 
 
 @pytest.mark.parametrize("sigma_m", [0.005, 0.02, 0.05, 0.1])
@@ -80,6 +80,19 @@ def test_returns_that_are_missing_are_left_out():
 )
 def test_nothing_is_said_without_returns(made):
     assert found(made) is None
+
+
+def test_beams_need_not_be_evenly_spaced():
+    """Those of a cloud are where its points are; one in five is missing here."""
+    keep = np.random.default_rng(3).random(len(ANGLES)) < 0.8
+    noise = find_range_noise((ranges[keep], ANGLES[keep]) for ranges in scans(0.05))
+    assert noise.sigma_m == pytest.approx(0.05, rel=0.1)
+
+
+def test_angles_that_are_none_tell_nothing():
+    made = scans(0.05)
+    for bearings in (np.zeros(len(ANGLES)), np.full(len(ANGLES), np.nan)):
+        assert find_range_noise((ranges, bearings) for ranges in made) is None
 
 
 def test_the_quantiles_are_those_of_white_noise():
