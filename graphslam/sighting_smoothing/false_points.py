@@ -8,7 +8,7 @@ show others beside it and behind it, but not it.
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
@@ -79,6 +79,6 @@ def _are_false(places: Array, poses: Array, image: IntArray, point: IntArray, z:
     rates = hits / np.maximum(times, 1)
     often = count >= FEW * usual_count
     usual = np.median(np.repeat(rates[often], count[often]))
-    seldom = binom.cdf(hits, times, SELDOM * usual) < CHANCE
+    seldom = bdtr(hits, times, SELDOM * usual) < CHANCE
     stayed = (hits_there >= FOR_A_WHILE) & (hits_there >= SELDOM * usual * there)
     return np.asarray(seldom & ~often & ~stayed)
