@@ -157,7 +157,9 @@ def find_log(folder: Path, name: str) -> Path:
     if name in FREIBURG_LOGS:
         _check(FREIBURG / f"{name}.clf.bz2")
         return import_freiburg(name, folder)
-    return _imported("mrclam", MRCLAM, folder / "mrclam6.mcap")
+    if name == "mrclam6":
+        return _imported("mrclam", MRCLAM, folder / "mrclam6.mcap")
+    raise AbsentError(f"logs/{name}.mcap is not there")
 
 
 def _check(source: Path) -> None:
