@@ -157,7 +157,7 @@ def find_log(folder: Path, name: str) -> Path:
     if name in FREIBURG_LOGS:
         _check(FREIBURG / f"{name}.clf.bz2")
         return import_freiburg(name, folder)
-    if name == "mrclam6":
+    if kind == "mrclam6":
         return _imported("mrclam", MRCLAM, folder / "mrclam6.mcap")
     raise AbsentError(f"logs/{name}.mcap is not there")
 
