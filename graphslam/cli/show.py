@@ -17,6 +17,7 @@ from graphslam.core.geometry import area_centroid
 from graphslam.core.records import Result
 from graphslam.importers import ImportSummary
 from graphslam.logs import LogInfo, RobotInfo, TopicInfo
+from graphslam.logs.laser_noise import RangeNoise
 from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
 from graphslam.results.report_comparison import (
     FILTER_WIN_HEADS,
@@ -405,7 +406,15 @@ def _scan(topic: TopicInfo) -> str:
     ]
     if topic.dropouts is not None:
         parts.append(f"{100 * topic.dropouts:.1f} % of the beams without a range")
+    if topic.range_noise is not None:
+        parts.append(f"noise {_noise(topic.range_noise)}")
     return ", ".join(parts)
+
+
+def _noise(noise: RangeNoise) -> str:
+    """White noise of ranges."""
+    grows = f" and {100 * noise.ratio:.1f} % of the range" if noise.ratio else ""
+    return f"{1000 * noise.sigma_m:.0f} mm{grows}"
 
 
 def _span(topics: Sequence[TopicInfo]) -> str:

@@ -247,6 +247,7 @@ def _topic_info(
         scan=scan_shape(files, topic) if is_scan else None,
         no_return_m=float(no_return) if is_scan and np.isfinite(no_return) else None,
         dropouts=reading.empty_beams / reading.beams if reading.beams else None,
+        range_noise=contexts[topic.name].range_noise,
         recorded_after_s=float(np.median(reading.delays_ns)) * 1e-9,
         by_log_time=contexts[topic.name].by_log_time,
     )

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from graphslam.logs.laser_noise import RangeNoise
 from graphslam.logs.topic_context import ScanShape
 
 
@@ -22,10 +23,10 @@ class TopicInfo:
     messages come in bursts. ``jumps_back`` counts messages stamped earlier than the one recorded
     before, ``glitches`` those whose stamp is replaced, ``too_late`` those that are dropped, up to
     ``latest_s`` late. ``no_return_m`` is the detected range that means no return, ``dropouts`` the
-    share of beams without a usable range. ``recorded_after_s`` is the median time from the stamp of
-    a message to its recording, by the clock of the recorder; ``by_log_time``: the messages have no
-    stamps, and that of their recording is taken. ``joints`` are the names in a JointState of which
-    no message can be used.
+    share of beams without a usable range, ``range_noise`` that of the others, by their scatter.
+    ``recorded_after_s`` is the median time from the stamp of a message to its recording, by the
+    clock of the recorder; ``by_log_time``: the messages have no stamps, and that of their recording
+    is taken. ``joints`` are the names in a JointState of which no message can be used.
     """
 
     name: str
@@ -46,6 +47,7 @@ class TopicInfo:
     scan: ScanShape | None = None
     no_return_m: float | None = None
     dropouts: float | None = None
+    range_noise: RangeNoise | None = None
     recorded_after_s: float | None = None
     by_log_time: bool = False
     joints: tuple[str, ...] = ()

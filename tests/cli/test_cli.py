@@ -127,7 +127,7 @@ def test_output_for_people_says_what_was_found_and_where_the_report_is(room, tmp
     assert tables[0].split()[:3] == ["robot", "ATE,", "m"]
     assert [line.split()[:2] for line in tables[1:3]] == [["robot", "final"], ["robot", "causal"]]
     info = call("info", room.log).out
-    assert "/scan: 181 beams over 180 deg" in info
+    assert re.search(r"^/scan: 181 beams over 180 deg, .*, noise \d+ mm$", info, re.MULTILINE)
     assert f"usable: graphslam smooth {room.log} -o DIR" in info
 
 
