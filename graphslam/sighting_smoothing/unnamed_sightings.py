@@ -124,10 +124,12 @@ def _false_points(
     estimate: Estimate,
 ) -> set[int]:
     """Points of an estimate that images hardly ever show; their sightings are counted."""
-    fine, there = problem.at_sightings(steps, estimate)
-    false = find_false_points(fine, there, _unnamed_points(one.landmarks, estimate))
-    of_these = [a for step in steps for a in step.associations if is_point(a, false)]
+    points = _unnamed_points(one.landmarks, estimate)
+    if not points:
+        return set()
+    false = find_false_points(*problem.at_sightings(steps, estimate), points)
     if false:
+        of_these = [a for step in steps for a in step.associations if is_point(a, false)]
         one.rejected[HARDLY_EVER_SEEN] += len(of_these)
         one.counts["landmarks_removed"] += len(false)
     return false
