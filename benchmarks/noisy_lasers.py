@@ -1,6 +1,6 @@
 """Lasers whose ranges are noisier than those of Intel: is their noise found, and used?
 
-    python benchmarks/noisy_lasers.py [lab|office-loop|corridor ...] [--noise M:SHARE ...]
+    python benchmarks/noisy_lasers.py [lab|office-loop|corridor ...] [--noise M:RATIO ...]
         [--seeds 3] [--first 1] [--as-set]
 
 Every place with every noise: white, of so many metres and of such a share of the range (the root of
@@ -33,10 +33,10 @@ AS_SET: Mapping[str, Any] = {"front_end": {"range_sigma_m": 0.0200001}}
 
 def run(place: str, noise: str, seed: int, folder: Path, settings: Mapping[str, Any]) -> bool:
     """Print one line; whether it is as it should be."""
-    sigma_m, share = map(float, noise.split(":"))
+    sigma_m, ratio = map(float, noise.split(":"))
     scenario = load_scenario(place)
     ((name, vehicle),) = scenario.robots.items()
-    laser = replace(vehicle.laser, range_sigma_m=sigma_m, range_sigma_ratio=share)
+    laser = replace(vehicle.laser, range_sigma_m=sigma_m, range_sigma_ratio=ratio)
     log, out = folder / "log.mcap", folder / "out"
     simulate(replace(scenario, robots={name: replace(vehicle, laser=laser)}), log, seed)
     start = {"from_truth": True}
@@ -51,20 +51,20 @@ def run(place: str, noise: str, seed: int, folder: Path, settings: Mapping[str, 
         f"  {verdict}",
         flush=True,
     )
-    ratio = _at(found["range_sigma_m"], found["range_sigma_ratio"]) / _at(sigma_m, share)
+    found_to_true = _at(found["range_sigma_m"], found["range_sigma_ratio"]) / _at(sigma_m, ratio)
     is_right = final["ate_aligned_rmse_m"] <= ALIGNED_M and final["nees_per_dof"] <= NEES
-    return verdict == "good" and is_right and abs(ratio - 1) <= OFF
+    return verdict == "good" and is_right and abs(found_to_true - 1) <= OFF
 
 
-def _at(sigma_m: float, share: float) -> float:
-    return math.hypot(sigma_m, AT_M * share)
+def _at(sigma_m: float, ratio: float) -> float:
+    return math.hypot(sigma_m, AT_M * ratio)
 
 
 def main() -> int:
     """Print the table."""
     options = parser(__doc__)
     options.add_argument("places", nargs="*", default=["lab", "office-loop", "corridor"])
-    options.add_argument("--noise", nargs="+", default=list(NOISE), metavar="M:SHARE")
+    options.add_argument("--noise", nargs="+", default=list(NOISE), metavar="M:RATIO")
     options.add_argument("--seeds", type=int, default=3)
     options.add_argument("--first", type=int, default=1)
     options.add_argument("--as-set", action="store_true")

@@ -17,7 +17,7 @@ from graphslam.core.geometry import area_centroid
 from graphslam.core.records import Result
 from graphslam.importers import ImportSummary
 from graphslam.logs import LogInfo, RobotInfo, TopicInfo
-from graphslam.logs.laser_noise import RangeNoise
+from graphslam.logs.laser_noise import BeamNoise
 from graphslam.results.metric_tables import evaluation_notes, evaluation_tables
 from graphslam.results.report_comparison import (
     FILTER_WIN_HEADS,
@@ -411,7 +411,7 @@ def _scan(topic: TopicInfo) -> str:
     return ", ".join(parts)
 
 
-def _noise(noise: RangeNoise) -> str:
+def _noise(noise: BeamNoise) -> str:
     """White noise of ranges."""
     grows = f" and {100 * noise.ratio:.1f} % of the range" if noise.ratio else ""
     return f"{1000 * noise.sigma_m:.0f} mm{grows}"

@@ -211,10 +211,10 @@ class FrontEndConfig:
     of which an end may be hidden is kept as a `line`, or `reject`ed as in thesis 4.7.8. min_points,
     min_length_m: smaller segments are dropped. range_sigma_m, range_sigma_ratio: white range noise,
     and what it grows by with the range (the root of the sum of their squares counts); unless one of
-    them is set, the noise of the log's lasers is measured and used where it is larger. What is more
-    than the default adds 2.5 sigmas to split_m (again by squares). floor_normal_m, floor_angle_rad:
-    error of a line that does not shrink with the number of points (material, flatness, bias of the
-    laser). end_sigma_m: error of a segment's end where the wall ends.
+    them is set, the noise of the log's lasers is measured, and used where it is 1.5 times as large.
+    What is more than the default adds 2.5 sigmas to split_m (again by squares). floor_normal_m,
+    floor_angle_rad: error of a line that does not shrink with the number of points (material,
+    flatness, bias of the laser). end_sigma_m: error of a segment's end where the wall ends.
     covariance: `incidence` weights each point by its noise along the normal, `thesis` uses eq. 4.32
     as printed. Hough lines (4.7.1-4.7.3): hough_votes says what counts votes, `opencv`'s transform
     with the thesis' weights to rank and refine its lines, or the weighted accumulator of the

@@ -17,7 +17,7 @@ from graphslam.core.geometry import Array
 from graphslam.logs import physical_limits as limits
 from graphslam.logs import schemas
 from graphslam.logs.cdr import CdrError
-from graphslam.logs.laser_noise import RangeNoise
+from graphslam.logs.laser_noise import BeamNoise
 from graphslam.logs.mounts import Mount, levelled
 from graphslam.logs.point_cloud import beam_step, cloud_points, is_planar, sweep_of
 from graphslam.logs.record_checks import (
@@ -50,12 +50,11 @@ class TopicContext:
     frames of sensors that are mounted upside down, ``tilted`` has the mounts of those that are not
     level. Ranges of ``no_return_m`` or more mean no return; ``range_noise`` is that of the others,
     None where it is not known. With ``at_once`` all beams of a scan count as measured at its stamp.
-    ``beams`` counts
-    dropped beams of scans that are kept, by reason. With ``without_ranges`` scans get no ranges:
-    only when they were taken is of interest. ``by_log_time``: the messages have no stamps; that of
-    their recording is taken. ``sensor``: see `records.Scan`. ``only_frame``: if given, scans
-    in other frames are dropped. ``session``: of a recording of several robots, which messages
-    name as that recording does.
+    ``beams`` counts dropped beams of scans that are kept, by reason. With ``without_ranges`` scans
+    get no ranges: only when they were taken is of interest. ``by_log_time``: the messages have no
+    stamps; that of their recording is taken. ``sensor``: see `records.Scan`. ``only_frame``: if
+    given, scans in other frames are dropped. ``session``: of a recording of several robots, which
+    messages name as that recording does.
     """
 
     robot: str
@@ -63,7 +62,7 @@ class TopicContext:
     inverted: frozenset[str] = frozenset()
     tilted: Mapping[str, Mount] = field(default_factory=dict)
     no_return_m: float = np.inf
-    range_noise: RangeNoise | None = None
+    range_noise: BeamNoise | None = None
     at_once: bool = False
     left_joint: str = ""
     right_joint: str = ""

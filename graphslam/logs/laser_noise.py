@@ -32,7 +32,7 @@ NEAREST_M = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class RangeNoise:
+class BeamNoise:
     """White noise of ranges: sigma is the root of sigma_m² + (ratio * range)².
 
     ``farthest_m``: the largest ranges that it was measured at.
@@ -48,7 +48,7 @@ class RangeNoise:
         return math.hypot(self.sigma_m, self.ratio * self.farthest_m)
 
 
-def find_range_noise(scans: Iterable[tuple[ArrayLike, ArrayLike]]) -> RangeNoise | None:
+def find_range_noise(scans: Iterable[tuple[ArrayLike, ArrayLike]]) -> BeamNoise | None:
     """The noise of a laser; None if too few of its returns are of smooth surfaces.
 
     Args:
@@ -81,17 +81,17 @@ def _windows(ranges: Array, bearings: Array) -> tuple[Array, Array]:
         three = np.array([r[:-2], r[1:-1], r[2:]])
         # a range that is off by e changes its inverse by e / range²; the three variances add up
         square = (shares / three).sum(axis=0) ** 2 / ((shares / three**2) ** 2).sum(axis=0)
-    whole = max(len(square), 0) // WINDOW * WINDOW
+    whole = len(square) // WINDOW * WINDOW
     square = square[:whole].reshape(-1, WINDOW).mean(axis=1)
     at = np.sqrt((r[1 : whole + 1] ** 2).reshape(-1, WINDOW).mean(axis=1))
     there = np.isfinite(square)
     return at[there], np.sqrt(square[there])
 
 
-def _fitted(at: Array, variance: Array, number: Array) -> RangeNoise:
+def _fitted(at: Array, variance: Array, number: Array) -> BeamNoise:
     """The noise that has the variances (k,), m², at ranges (k,), m, of so many windows (k,)."""
     farthest = float(at.max())
-    constant = RangeNoise(math.sqrt(np.average(variance, weights=number)), 0.0, farthest)
+    constant = BeamNoise(math.sqrt(np.average(variance, weights=number)), 0.0, farthest)
     if variance[-1] < LEAST_GROWTH**2 * variance[0]:
         return constant
     weight = np.sqrt(number) / variance
@@ -101,4 +101,4 @@ def _fitted(at: Array, variance: Array, number: Array) -> RangeNoise:
         return constant
     if own < 0:
         square_ratio = np.average(variance / at**2, weights=number)
-    return RangeNoise(math.sqrt(max(own, 0.0)), math.sqrt(square_ratio), farthest)
+    return BeamNoise(math.sqrt(max(own, 0.0)), math.sqrt(square_ratio), farthest)

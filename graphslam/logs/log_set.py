@@ -21,7 +21,7 @@ from graphslam.logs.file_reader import NO_SPANS, FileReader, stamp_warnings
 from graphslam.logs.findings import Finding
 from graphslam.logs.gyroscopes import find_gyroscopes
 from graphslam.logs.imu_turning import Turning, with_turning
-from graphslam.logs.laser_noise import RangeNoise
+from graphslam.logs.laser_noise import BeamNoise
 from graphslam.logs.lasers import further_lasers
 from graphslam.logs.recording import Recording, sample_messages
 from graphslam.logs.robots import robots_and_topics
@@ -164,7 +164,7 @@ class LogSet:
         """Smallest range, m, that means no return in ``topic``; inf if none was detected."""
         return self._contexts[topic].no_return_m
 
-    def range_noise(self, topic: str) -> RangeNoise | None:
+    def range_noise(self, topic: str) -> BeamNoise | None:
         """White noise of the ranges of a laser by its own scans; None if it is not known."""
         return self._contexts[topic].range_noise
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from graphslam.logs.laser_noise import RangeNoise
+from graphslam.logs.laser_noise import BeamNoise
 from graphslam.logs.topic_context import ScanShape
 
 
@@ -47,7 +47,7 @@ class TopicInfo:
     scan: ScanShape | None = None
     no_return_m: float | None = None
     dropouts: float | None = None
-    range_noise: RangeNoise | None = None
+    range_noise: BeamNoise | None = None
     recorded_after_s: float | None = None
     by_log_time: bool = False
     joints: tuple[str, ...] = ()

@@ -23,7 +23,7 @@ from graphslam.core.records import Association, Estimate, KeyframeScan, Step
 from graphslam.mapping.landmark_map import Entry, observed_from
 from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
 from graphslam.mapping.submaps import State
-from graphslam.perception.range_noise import largest_deviation
+from graphslam.perception.beam_noise import largest_deviation
 
 #: rad: how well the direction of a scan is known before (one sigma)
 HEADING_RAD = 0.003

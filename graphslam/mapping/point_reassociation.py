@@ -57,13 +57,11 @@ class PointSightings:
         G_x, G_z = MODELS["point"].invert_jacobians(z, x)
         cov = G_z @ np.array([a.cov for a in seen]).reshape(-1, 2, 2) @ G_z.mT
         cov += G_x @ _state_covs(seen, estimate) @ G_x.mT
-        robots = {robot: k for k, robot in enumerate(sorted({a.robot for a in seen}))}
-        images = np.array([(robots[a.robot], a.time_ns) for a in seen], dtype=np.int64)
         return cls(
             MODELS["point"].invert(z, x),
             cov,
             np.linalg.inv(cov),
-            np.unique(images.reshape(-1, 2), axis=0, return_inverse=True)[1].ravel(),
+            image_numbers(seen)[1],
             np.array([a.target for a in seen], dtype=np.int64),
         )
 
@@ -82,6 +80,19 @@ def _state_covs(seen: Sequence[Association], estimate: Estimate) -> Array:
         own = robots == robot
         covs[own] = np.nan_to_num(states.covs[states.index(times[own])])
     return covs
+
+
+def image_numbers(seen: Sequence[Association]) -> tuple[IntArray, IntArray]:
+    """The first (m,) of the associations of each image, and the image (n,) of each association.
+
+    Sightings of one robot at one time are one image.
+    """
+    robots = {robot: k for k, robot in enumerate(sorted({a.robot for a in seen}))}
+    images = np.array([(robots[a.robot], a.time_ns) for a in seen], dtype=np.int64)
+    _, first, image = np.unique(
+        images.reshape(-1, 2), axis=0, return_index=True, return_inverse=True
+    )
+    return first, image.ravel()
 
 
 def is_point(a: Association, points: Collection[int]) -> bool:

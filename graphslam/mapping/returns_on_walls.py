@@ -17,8 +17,8 @@ from graphslam.core.arrays import IntArray
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array
 from graphslam.mapping.wall_samples import sample_walls
+from graphslam.perception.beam_noise import range_variance
 from graphslam.perception.line_fit import SMALLEST_SIGMA_M
-from graphslam.perception.range_noise import range_variance
 
 #: m: walls are sampled at this distance to find those near a return
 SAMPLE_M = 0.25

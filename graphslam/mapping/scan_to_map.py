@@ -19,7 +19,7 @@ from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, between, rotate_cov, transform_each, wrap
 from graphslam.mapping.returns_on_walls import OnWalls, WallTree, returns_on_walls
-from graphslam.perception.range_noise import noisier
+from graphslam.perception.beam_noise import noisier
 
 #: sigmas that a return may be off the wall that it is taken for, and from which on it pulls with
 #: less than its distance (Huber)

@@ -16,9 +16,9 @@ from scipy.special import chdtri
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, wrap
 from graphslam.core.records import Observation
+from graphslam.perception.beam_noise import range_variance
 from graphslam.perception.line_moments import fitted_lines, mean_square, mean_square_range
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
-from graphslam.perception.range_noise import range_variance
 from graphslam.perception.segments import MISSING_BEAMS
 
 ITERATIONS = 3

@@ -17,6 +17,7 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
+from graphslam.perception.beam_noise import largest_deviation, range_variance
 from graphslam.perception.hough_votes import HOUGH_VOTES, SEED_POINTS
 from graphslam.perception.line_fit import fit_lines, observations
 from graphslam.perception.line_moments import (
@@ -26,7 +27,6 @@ from graphslam.perception.line_moments import (
     mean_square_range,
 )
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
-from graphslam.perception.range_noise import largest_deviation, range_variance
 from graphslam.perception.segments import MISSING_BEAMS, allowed_rms, fewest_points, valid_lines
 
 RUN_POINTS = 3

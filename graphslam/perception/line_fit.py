@@ -13,8 +13,8 @@ from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, rotation3, wrap
 from graphslam.core.observation_arrays import LINE, SEGMENT, ObservationArrays
 from graphslam.core.records import Observation
+from graphslam.perception.beam_noise import range_variance
 from graphslam.perception.ordered_scan import Indices, Mask
-from graphslam.perception.range_noise import range_variance
 
 SMALLEST_SIGMA_M = 1e-4
 """Floor of one point's normal noise where the settings have none: weights stay finite."""

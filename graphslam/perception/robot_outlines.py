@@ -17,8 +17,8 @@ from scipy.special import chdtri
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, polar_points, rotation, unit_vectors, wrap
+from graphslam.perception.beam_noise import range_variance
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
-from graphslam.perception.range_noise import range_variance
 
 #: m, beams, m: returns farther apart are not of one free-standing object: a distance, as many times
 #: the distance between beams if that is more (a side at grazing incidence), and an upper limit

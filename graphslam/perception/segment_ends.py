@@ -9,9 +9,9 @@ import numpy as np
 
 from graphslam.core.config import FrontEndConfig
 from graphslam.core.geometry import Array, wrap
+from graphslam.perception.beam_noise import largest_deviation
 from graphslam.perception.line_fit import LineFits
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
-from graphslam.perception.range_noise import largest_deviation
 
 BEAMS_BESIDE = 2
 """Beams beyond an end that are tested: the first may be a mixed pixel of an occluding edge."""

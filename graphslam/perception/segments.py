@@ -15,11 +15,11 @@ from graphslam.core.config import FrontEndConfig
 from graphslam.core.gaussian import chi2_quantile
 from graphslam.core.geometry import Array
 from graphslam.core.records import Observation
+from graphslam.perception.beam_noise import largest_deviation, range_variance
 from graphslam.perception.breaks import Returns, moved_breaks, without_breaks
 from graphslam.perception.line_fit import LineFits, fit_lines, observations
 from graphslam.perception.line_moments import fitted_lines, mean_square, mean_square_range
 from graphslam.perception.ordered_scan import Indices, Mask, Sweep
-from graphslam.perception.range_noise import largest_deviation, range_variance
 from graphslam.perception.segment_ends import fully_visible
 from graphslam.perception.variance_split import first_and_last, split_by_variance
 
@@ -313,8 +313,8 @@ def _near(
 ) -> tuple[Indices, Indices]:
     """Of runs of ``rows``, ``counts`` (m,) each, those near the lines that ``fitted`` (6, m) have.
 
-    ``deviations``: how near, in largest deviations of a return of a line.
-    A row in two neighbouring runs stays in that with the closer line.
+    ``deviations``: how near, in largest deviations of a return of a line. A row in two neighbouring
+    runs stays in that with the closer line.
     """
     owner = np.repeat(np.arange(len(counts)), counts)
     each = moments[:, rows]

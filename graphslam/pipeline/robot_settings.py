@@ -47,7 +47,7 @@ def check_robots(log: LogSet, config: Config) -> None:
 def with_log_settings(log: LogSet, config: Config) -> Config:
     """The configuration with what the log says in place of defaults.
 
-    That are noted keyframe settings, and the noise of the noisiest laser.
+    These are keyframe settings that are noted in it, and the noise of the noisiest laser.
     """
     return replace(
         config,

@@ -14,7 +14,7 @@ from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate, Step
 from graphslam.mapping.landmark_map import observed_from
-from graphslam.mapping.point_reassociation import is_point
+from graphslam.mapping.point_reassociation import image_numbers, is_point
 from graphslam.mapping.points_in_sight import points_in_sight
 
 #: a point that is seen by less than this share of what is usual of points in sight is none, if one
@@ -44,11 +44,9 @@ def find_false_points(
         return set()
     x, z = observed_from(seen, estimate.states), np.array([a.z for a in seen])
     numbers, point = np.unique([int(a.target) for a in seen], return_inverse=True)
-    robots = {robot: k for k, robot in enumerate(sorted({a.robot for a in seen}))}
-    images = np.array([(robots[a.robot], a.time_ns) for a in seen], dtype=np.int64)
-    _, first, image = np.unique(images, axis=0, return_index=True, return_inverse=True)
+    first, image = image_numbers(seen)
     places = np.array([estimate.landmarks[i][0][:2] for i in numbers.tolist()])
-    false = _are_false(places, x[first], image.ravel(), point.ravel(), z)
+    false = _are_false(places, x[first], image, point, z)
     return set(numbers[false].tolist())
 
 

@@ -62,8 +62,8 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
 
     found = solved_with_sensors(one, estimate, solve)
     estimate, solved = found.estimate, found.steps
-    one.counts["landmarks_merged"] += before - len(estimate.landmarks)
-    one.counts["landmarks_merged"] -= one.counts["landmarks_removed"]
+    gone = before - len(estimate.landmarks)
+    one.counts["landmarks_merged"] += gone - one.counts["landmarks_removed"]
     landmarks.update_from(solved, estimate)
     _count_sightings(landmarks, solved, _unnamed_points(landmarks, estimate))
     return estimate, solved
