@@ -29,10 +29,9 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
     from graphslam.change_detection import Change, ChangeResult
@@ -184,17 +183,16 @@ def smooth(
     from graphslam.core.worker import Future
     from graphslam.pipeline.progress import of_all
     from graphslam.results.target_folder import check_target
-    from graphslam.scan_smoothing.log_reader import receive_log
-    from graphslam.slam.given_recording import read_ahead, settle
+    from graphslam.slam.given_recording import reading_ahead, settle
 
     settled = settle(recording, config, settings)
     before = None
     if output is not None:
         prior_map = settled.known_map.directory
         before = check_target(Path(output), force=force, known_map=prior_map)
-    reading = read_ahead(recording, settled) or nullcontext()
-    with limited_memory(settled.limits.memory_mb), reading as ahead:
-        # imported while the second process reads; what only that one needs is imported there
+    limit = limited_memory(settled.limits.memory_mb)
+    with limit, reading_ahead(recording, settled) as (log, ahead):
+        # imported while the second process reads
         from graphslam.core.stages import announce
         from graphslam.pipeline.checkpoint import checkpoint
         from graphslam.results.folder import save
@@ -206,7 +204,6 @@ def smooth(
             from graphslam.results.report import render
 
         earlier = known_map_of(settled)
-        log = cast("LogSet", recording) if ahead is None else receive_log(ahead, settled)
 
         with checkpoint(output, log, settled, earlier, resume=resume) as kept:
             truth = None if output is None else truth_later(log)

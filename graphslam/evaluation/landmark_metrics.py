@@ -137,15 +137,12 @@ def _match(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> list[
     rows, cost = [i for i, is_wall in zip(rows, wall, strict=True) if not is_wall], cost[~wall]
     if not rows:
         return pairs
-    # a forbidden pair costs more than all allowed ones together, so as many as possible match
-    forbidden = MATCH_DISTANCE_M * (1 + min(cost.shape))
-    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415  (imports for long)
+    from graphslam.core.assignment import cheapest_assignment  # noqa: PLC0415  (imports for long)
 
-    chosen = linear_sum_assignment(np.where(np.isfinite(cost), cost, forbidden))
-    matched = [
-        (rows[r], columns[c]) for r, c in zip(*chosen, strict=True) if np.isfinite(cost[r, c])
-    ]
-    return pairs + matched
+    # none costs more than all matches together, so as many as possible match
+    none = np.full(len(rows), MATCH_DISTANCE_M * (1 + min(cost.shape)))
+    matched = zip(*cheapest_assignment(cost, none), strict=True)
+    return pairs + [(rows[r], columns[c]) for r, c in matched]
 
 
 def _match_costs(estimated: Sequence[Landmark], true: Sequence[TrueLandmark]) -> Array:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.optimize  # noqa: F401 (association needs it: imported then, it delays a scan by 0.1 s)
 
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array, between, compose, compose_cov, inverse, transform

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from graphslam.core.arrays import BoolArray, IntArray
+from graphslam.core.assignment import cheapest_assignment
 from graphslam.core.config import AssociationConfig
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
 from graphslam.core.geometry import Array, between, compose, rotate_cov, wrap
@@ -284,7 +285,7 @@ def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
         Pairs (row, column), sorted by row.
     """
     allowed = np.where(cost < gate, cost, np.inf)
-    n, m = allowed.shape
+    m = allowed.shape[1]
     possible = np.flatnonzero(np.isfinite(allowed).any(axis=1))
     if not len(possible):
         return []
@@ -298,19 +299,9 @@ def assign(cost: Array, gate: Array, method: str) -> list[tuple[int, int]]:
             found.append((i, j))
             allowed[i, :] = allowed[:, j] = np.inf
         return sorted(found)
-    # a column per row stands for "no landmark", so the problem is always feasible
-    alone = np.full((n, n), np.inf)
-    np.fill_diagonal(alone, np.where(np.isfinite(allowed), gate, 0.0).max(axis=1))
-    table = np.concatenate([allowed, alone], axis=1)
-    # a fifth of a second to import, while other processes work
-    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415
-
-    rows, columns = linear_sum_assignment(np.where(np.isfinite(table), table, 1e9))
-    return [
-        (int(i), int(j))
-        for i, j in zip(rows, columns, strict=True)
-        if j < m and np.isfinite(allowed[i, j])
-    ]
+    alone = np.where(np.isfinite(allowed), gate, 0.0).max(axis=1)
+    rows, columns = cheapest_assignment(allowed, alone)
+    return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
 
 def jointly_compatible(

@@ -111,7 +111,7 @@ ReadItem = KeyframeBlock | ReadLog | AwaitCalibration
 
 def read_keyframes(
     log: LogSet, config: Config, uncalibrated: int, known: Learnt | None = None
-) -> Generator[LogSet | ReadItem, Learnt | None, None]:
+) -> Generator[ReadItem, Learnt | None, None]:
     """The keyframes of the only robot of a log, and last a `ReadLog`.
 
     What is sent is the calibration for later motions, and their noise. After ``uncalibrated``

@@ -24,7 +24,7 @@ from graphslam.odometry.online_calibration import (
 )
 from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.log_pass import LogPass, PriorKnowledge, Progress, timed
-from graphslam.scan_smoothing.log_reader import Reading, read_ahead
+from graphslam.scan_smoothing.log_reader import Reading, read_keyframes_ahead
 from graphslam.scan_smoothing.motion_checks import MotionChecker, ScanKeyframe
 from graphslam.scan_smoothing.scan_keyframes import KeyframeBlock, ReadLog
 
@@ -124,7 +124,7 @@ class ScanLog(TrackedLog):
         """
         known: CalibrationEvidence | None = None
         learnt: Learnt | None = None
-        with ahead or read_ahead(self.log, self.given_config, before) as reading:
+        with ahead or read_keyframes_ahead(self.log, self.given_config, before) as reading:
             while (item := reading.receive()) is not None:
                 if isinstance(item, ReadLog):
                     self._finish(item, learnt)

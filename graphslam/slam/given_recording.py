@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -50,10 +51,18 @@ def opened(recording: Recording, config: Config) -> LogSet:
     return recording if isinstance(recording, LogSet) else open_logs(paths_of(recording), config)
 
 
-def read_ahead(recording: Recording, config: Config) -> Reading | None:
-    """The logs and what follows in them, from the background; None if they are open already."""
-    from graphslam.scan_smoothing.log_reader import open_ahead  # noqa: PLC0415 (not needed by who compares)
+@contextmanager
+def reading_ahead(recording: Recording, config: Config) -> Iterator[tuple[LogSet, Reading | None]]:
+    """The open logs, and what is read of them in the background; None if they were open already.
 
-    if isinstance(recording, LogSet):
-        return None
-    return open_ahead(lambda: opened(recording, config), config)
+    Raises:
+        LogError: see `open_logs`.
+    """
+    from graphslam.scan_smoothing.log_reader import read_ahead  # noqa: PLC0415 (not needed by who compares)
+
+    log = opened(recording, config)
+    if log is recording:
+        yield log, None
+        return
+    with read_ahead(log, config) as ahead:
+        yield log, ahead

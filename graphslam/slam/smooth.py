@@ -41,7 +41,7 @@ def smooth(
         config: settings.
         progress: called with the number of messages read so far.
         tamper: for tests, see `graphslam.mapping.loop_closure.Tamper`.
-        ahead: what `graphslam.scan_smoothing.log_reader.open_ahead` gives after the log.
+        ahead: what `graphslam.scan_smoothing.log_reader.read_ahead` gives, if anything.
         kept: where stages are kept, and those of an earlier run.
         known_map: of an earlier result, in which the log is localised.
 

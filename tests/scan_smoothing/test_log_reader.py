@@ -14,7 +14,7 @@ from graphslam.pipeline.keyframes import KeyframeSelector
 from graphslam.pipeline.robot_settings import make_tracks
 from graphslam.pipeline.robot_state import RobotState
 from graphslam.pipeline.synchronisation import synchronise
-from graphslam.scan_smoothing.log_reader import open_ahead, receive_log
+from graphslam.scan_smoothing.log_reader import read_ahead
 
 
 @pytest.mark.parametrize("second", [False, True])
@@ -27,8 +27,8 @@ def test_messages_are_taken_from_the_reading_that_has_begun(tmp_path, second):
     messages = list(expected.messages(TRUE_RECORDS))
     allow_fork(second=second)
     try:
-        with open_ahead(lambda: open_logs([path], config), config) as reading:
-            log = receive_log(reading, config)
+        log = open_logs([path], config)
+        with read_ahead(log, config) as reading:
             for _ in range(2):
                 found = list(log.messages(TRUE_RECORDS))
                 assert [type(m) for m in found] == [type(m) for m in messages]
