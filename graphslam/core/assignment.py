@@ -1,7 +1,7 @@
 """One-to-one assignment at the least cost."""
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from graphslam.core.arrays import IntArray
@@ -19,13 +19,19 @@ def cheapest_assignment(cost: Array, alone: Array) -> tuple[IntArray, IntArray]:
         Numbers of the rows (k,), sorted, and of their columns (k,).
     """
     n, m = cost.shape
+    if not n:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     # a column per row stands for "none", so that each row has one; SciPy's assignment of sparse
-    # tables leaves impossible pairs out, and its module is one that is loaded anyway
-    rows, columns = np.nonzero(np.isfinite(cost))
-    each = np.arange(n)
-    table = np.concatenate([cost[rows, columns], alone])
-    table += 1.0 - table.min(initial=0.0)  # a weight of zero would be no edge
-    ends = np.append(rows, each), np.append(columns, m + each)
-    chosen = min_weight_full_bipartite_matching(coo_matrix((table, ends), shape=(n, m + n)).tocsr())
-    is_pair = chosen[1] < m
-    return chosen[0][is_pair], chosen[1][is_pair]
+    # tables leaves out what is impossible, and loads in a tenth of the time of that of dense ones
+    table = np.concatenate([cost, np.full((n, n), np.inf)], axis=1)
+    table[np.arange(n), m + np.arange(n)] = alone
+    possible = np.isfinite(table)
+    columns = possible.nonzero()[1]
+    weights = table[possible]
+    weights += 1.0 - weights.min()  # one of zero would be no edge
+    ends = np.concatenate([[0], possible.sum(axis=1).cumsum()])
+    rows, chosen = min_weight_full_bipartite_matching(
+        csr_matrix((weights, columns, ends), shape=table.shape)
+    )
+    is_pair = chosen < m
+    return rows[is_pair], chosen[is_pair]
