@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,15 +65,22 @@ class Used:
     peak_mb: float
 
 
-def measured_process(arguments: Sequence[str]) -> tuple[bytes, Used]:
+def measured_process(
+    arguments: Sequence[str], environment: Mapping[str, str] | None = None
+) -> tuple[bytes, Used]:
     """What a command prints, and what it and the processes that it waited for used.
+
+    ``environment``: variables beside those of this process.
 
     Raises:
         subprocess.CalledProcessError: its exit code is not 0.
     """
     with tempfile.NamedTemporaryFile("r") as report:
         launcher = [sys.executable, "-S", str(ROOT / "benchmarks/launch.py"), report.name]
-        done = subprocess.run([*launcher, *arguments], stdout=subprocess.PIPE, check=True)
+        variables = {**os.environ, **(environment or {})}
+        done = subprocess.run(
+            [*launcher, *arguments], stdout=subprocess.PIPE, check=True, env=variables
+        )
         wall_s, cpu_s, maxrss = map(float, report.read().split())
     return done.stdout, Used(wall_s, cpu_s, megabytes(maxrss))
 

@@ -51,6 +51,7 @@ SMALL: dict[str, list[str]] = {
     "sessions.py": ["office", "--seeds", "1"],
     "simulate_speed.py": [],
     "speed.py": ["--only", "help"],
+    "speed_in_turn.py": ["HEAD", "--jobs", "lab", "--repeats", "1"],
     "sweep_motion.py": ["--seeds", "1"],
     "three_filters.py": ["lab", "--seeds", "1"],
     "two_lasers.py": ["--seeds", "1"],
