@@ -5,9 +5,12 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.geometry import Array, rotation3
+from graphslam.core.motion_models import HELD_SIGMA, of_odometry
 from graphslam.core.records import Association, Estimate, Motion, Step
 from graphslam.estimation.backends import BACKENDS
 from graphslam.estimation.batch_calibration import calibrate_so_far, recompute_motions
@@ -16,6 +19,7 @@ from graphslam.estimation.fixed_lag import FixedLagBackend
 from graphslam.logs import LogSet
 from graphslam.mapping.data_association import Associator
 from graphslam.odometry.online_calibration import observed_information
+from graphslam.odometry.preintegration import Track
 from graphslam.pipeline.keyframes import KeyframeSelector
 from graphslam.pipeline.log_pass import LogPass, PriorKnowledge, timed
 
@@ -24,6 +28,9 @@ from graphslam.pipeline.log_pass import LogPass, PriorKnowledge, timed
 #: Intel's causal relations had half as much error again (before `perception.breaks`). From 20 steps
 #: on, parts of 450 s gain (Intel 0.026 instead of 0.033 m), whole logs do not: docs/tried-live.md
 FIRST_BATCH_STEP, BATCH_STEP_GROWTH = 100, 1.25
+#: before so many steps, a solution is used if it knows the odometry's parameters to this share of
+#: their sigmas before any data: a scale that is not known yet would move the robot and back
+OBSERVED_SHARE = 0.5
 
 
 class StepRecorder(LogPass):
@@ -33,7 +40,7 @@ class StepRecorder(LogPass):
     ``batch_is_due``: whether it is to be done, or goes on.
     """
 
-    batch_step_growth = BATCH_STEP_GROWTH
+    first_batch_step, batch_step_growth = FIRST_BATCH_STEP, BATCH_STEP_GROWTH
 
     def __init__(
         self, log: LogSet, config: Config, known: PriorKnowledge, *, batch_steps: bool = True
@@ -52,7 +59,7 @@ class StepRecorder(LogPass):
         # scans have states of their own nearby, each checked against the one before
         self._closure_starts = {r: deque(t) for r, t in starts.items() if not log.has_scans(r)}
         self.batch_is_due = False
-        self.next_batch_step = FIRST_BATCH_STEP if wanted and self.restarts() else math.inf
+        self.next_batch_step = self.first_batch_step if wanted and self.restarts() else math.inf
 
     def restarts(self) -> bool:
         """Whether the back end may go on from a solution of all steps: it has no horizon."""
@@ -171,17 +178,22 @@ class StepRecorder(LogPass):
 
         Returns:
             None if there is nothing to calibrate, as without odometry, if the back end is of
-            another kind, or if the solution fails.
+            another kind, if the solution fails, or knows too little of the calibration yet.
         """
         tracks = {name: run.track for name, run in self.started.items()}
         held = all(track.prior.is_held for track in tracks.values())
         if held or not isinstance(self.backend, CompressedBackend | FixedLagBackend):
             return None
+        before = {name: track.calibration for name, track in tracks.items()}
         try:
             found = calibrate_so_far(
                 self.steps, self.backend.current_estimate(), tracks, self.config.robust
             )
         except EstimationError:  # the tree goes on with QR where this calls it indeterminate
+            return None
+        if len(self.steps) < FIRST_BATCH_STEP and not all(map(_is_observed, tracks.values())):
+            for name, track in tracks.items():
+                track.calibration = before[name]
             return None
         self.steps[:] = recompute_motions(self.steps, tracks)
         for name, track in tracks.items():
@@ -225,3 +237,10 @@ class StepRecorder(LogPass):
         for robot, run in self.runs.items():
             if len(run.causal_covs) < len(run.times):
                 run.causal_covs.append(self.backend.joint(robot, []).cov)
+
+
+def _is_observed(track: Track) -> bool:
+    """Whether the calibration of a track's odometry is known much better than before any data."""
+    own = of_odometry(track.prior)
+    sigma, prior = (np.sqrt(np.diag(c.cov))[own] for c in (track.calibration, track.prior))
+    return bool(((sigma < OBSERVED_SHARE * prior) | (prior <= HELD_SIGMA)).all())
