@@ -21,6 +21,8 @@ from graphslam.odometry.noise_estimation import CLIP_SIGMAS, SIGMA_OF_MEDIAN
 DEGREES_OF_FREEDOM = (2.0, 3.0, 5.0, 8.0, 13.0, 20.0, 35.0, 60.0)
 #: rounds of expectation maximisation, after which the scale changes by less than a thousandth
 ROUNDS = 12
+#: least factor on a variance: residuals that are all zero have a size all the same
+LEAST_VARIANCE = 1e-12
 #: a shared error is significant if its variance is so many of the sigmas that it has by chance
 SIGNIFICANT_SIGMAS = 3.0
 
@@ -63,10 +65,11 @@ def _fits(squared: Array) -> _Fits:
     k, n = squared.shape
     nu = np.array(DEGREES_OF_FREEDOM)[:, None]
     # a median of squares of normal variables is 0.455
-    begin = np.maximum(np.median(squared, axis=1) / 0.455, 1e-12)
+    begin = np.maximum(np.median(squared, axis=1) / 0.455, LEAST_VARIANCE)
     variance = np.tile(begin, (len(nu), 1))
     for _ in range(ROUNDS):
-        variance = ((nu + k) / (nu + 1.0 / variance @ squared)) @ squared.T / n
+        found = ((nu + k) / (nu + 1.0 / variance @ squared)) @ squared.T / n
+        variance = np.maximum(found, LEAST_VARIANCE)
     each = [
         math.lgamma((v + k) / 2) - math.lgamma(v / 2) - k / 2 * math.log(v * math.pi)
         for v in DEGREES_OF_FREEDOM

@@ -45,7 +45,11 @@ class BeamNoise:
     @property
     def largest_m(self) -> float:
         """Sigma at the largest ranges that were measured."""
-        return math.hypot(self.sigma_m, self.ratio * self.farthest_m)
+        return self.at(self.farthest_m)
+
+    def at(self, range_m: float) -> float:
+        """Sigma at a range, m."""
+        return math.hypot(self.sigma_m, self.ratio * range_m)
 
 
 def find_range_noise(scans: Iterable[tuple[ArrayLike, ArrayLike]]) -> BeamNoise | None:

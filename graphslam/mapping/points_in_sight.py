@@ -9,6 +9,8 @@ from graphslam.core.geometry import Array, between, wrap
 #: share of the largest range in an image, and rad from its outermost bearings: what is within is in
 #: sight, since what is behind it or beside it is seen
 NEARER, MARGIN_RAD = 0.9, 0.05
+#: images that are compared with all points at once
+BLOCK = 1000
 
 
 def points_in_sight(places: Array, poses: Array, image: IntArray, z: Array) -> IntArray:
@@ -25,12 +27,14 @@ def points_in_sight(places: Array, poses: Array, image: IntArray, z: Array) -> I
     beside = wrap(z[:, 0] - middle[image])
     np.minimum.at(low, image, beside + MARGIN_RAD)
     np.maximum.at(high, image, beside - MARGIN_RAD)
-    near = cKDTree(places).query_ball_point(poses[:, :2], reach)
-    size = np.array([len(found) for found in near])
-    pairs = np.column_stack([
-        np.repeat(np.arange(m), size), np.concatenate([np.array(f, dtype=np.int64) for f in near])
-    ])  # fmt: skip
-    k = pairs[:, 0]
-    x, y = between(poses[k], np.column_stack([places[pairs[:, 1]], np.zeros(len(k))]))[:, :2].T
-    bearing = wrap(np.arctan2(y, x) - middle[k])
-    return np.asarray(pairs[(bearing > low[k]) & (bearing < high[k])])
+    tree, found = cKDTree(places), [np.zeros((0, 2), dtype=np.int64)]
+    for begin in range(0, m, BLOCK):
+        end = min(begin + BLOCK, m)
+        near = tree.query_ball_point(poses[begin:end, :2], reach[begin:end])
+        k = np.repeat(np.arange(begin, end), [len(own) for own in near])
+        point = np.concatenate([np.array(own, dtype=np.int64) for own in near])
+        x, y = between(poses[k], np.column_stack([places[point], np.zeros(len(k))]))[:, :2].T
+        bearing = wrap(np.arctan2(y, x) - middle[k])
+        inside = (bearing > low[k]) & (bearing < high[k])
+        found.append(np.column_stack([k[inside], point[inside]]))
+    return np.concatenate(found)

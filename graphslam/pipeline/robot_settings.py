@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import replace
-from operator import attrgetter
 from typing import TypeVar
 
 from graphslam.core.config import (
@@ -62,8 +61,11 @@ def with_range_noise(log: LogSet, config: FrontEndConfig) -> FrontEndConfig:
     told = config.range_sigma_m, config.range_sigma_ratio
     if told != (default.range_sigma_m, default.range_sigma_ratio):
         return config
-    of_lasers = [log.range_noise(topic.name) for topic in log.topics if topic.record is Scan]
-    noise = max(filter(None, of_lasers), key=attrgetter("largest_m"), default=None)
+    topics = [t.name for t in (*log.topics, *log.further_lasers) if t.record is Scan]
+    known = [noise for noise in map(log.range_noise, topics) if noise is not None]
+    # compared where all of them measured
+    common_m = min((noise.farthest_m for noise in known), default=0.0)
+    noise = max(known, key=lambda one: one.at(common_m), default=None)
     if noise is None or noise.largest_m < LEAST_NOISE * default.range_sigma_m:
         return config
     sigma_m = max(noise.sigma_m, default.range_sigma_m)

@@ -30,6 +30,8 @@ UNCALIBRATED_BLOCKS = 2
 #: messages that are read while nobody waits for them, and that are sent together then; scans are
 #: too large to be held like that
 READ_AHEAD, BATCH, BATCHES_AHEAD = 20_000, 256, 2
+#: batches that are asked for ahead: a pipe holds some thousand of such requests
+MOST_AHEAD = 1000
 
 
 def read_ahead(log: LogSet, config: Config) -> Reading:
@@ -66,8 +68,12 @@ def read_keyframes_ahead(log: LogSet, config: Config, known: Learnt | None = Non
 
 def _received(reading: Reading, batches: int) -> Iterator[Message | ReadReport]:
     """The messages of about so many batches; they need not be asked for one by one."""
-    for _ in range(batches):
+    asked = min(batches, MOST_AHEAD)
+    for _ in range(asked):
         reading.send(None)
     while (batch := reading.receive()) is not None:
         assert isinstance(batch, Packed)
+        if asked < batches:
+            reading.send(None)
+            asked += 1
         yield from unpacked(batch)

@@ -10,7 +10,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from scipy.special import bdtr
 
-from graphslam.core.arrays import IntArray
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.geometry import Array
 from graphslam.core.records import Estimate, Step
 from graphslam.mapping.landmark_map import observed_from
@@ -23,8 +23,10 @@ SELDOM, CHANCE = 0.25, 0.01
 #: and with fewer sightings than this share of those of a usual point: one that walls or other
 #: points hide from most places is seen as often as others from where it is not hidden
 FEW = 0.05
-#: sightings in one go of a point that was there for a while, and then was not
-FOR_A_WHILE = 10
+#: sightings of a point that was there for a while, or that one place alone shows, which is passed
+#: now and then: so many in stays of at least so many each. A stay has ended when so many images in
+#: a row do not show the point
+FOR_A_WHILE, STAY, GONE = 10, 3, 10
 
 
 def find_false_points(
@@ -46,16 +48,21 @@ def find_false_points(
     numbers, point = np.unique([int(a.target) for a in seen], return_inverse=True)
     first, image = image_numbers(seen)
     places = np.array([estimate.landmarks[i][0][:2] for i in numbers.tolist()])
-    false = _are_false(places, x[first], image, point, z)
+    names = {name: k for k, name in enumerate(sorted(estimate.states))}
+    robot = np.array([names[seen[k].robot] for k in first.tolist()])
+    false = _are_false(places, x[first], robot, image, point, z)
     return set(numbers[false].tolist())
 
 
-def _are_false(places: Array, poses: Array, image: IntArray, point: IntArray, z: Array) -> Array:
+def _are_false(
+    places: Array, poses: Array, robot: IntArray, image: IntArray, point: IntArray, z: Array
+) -> Array:
     """Whether points (n,) are seen too seldom.
 
     Args:
         places: (n, 2) m of the points.
-        poses: (m, 3) of the images.
+        poses: (m, 3) of the images, of each robot in the order of time.
+        robot: (m,) whose they are.
         image: (s,) of each sighting.
         point: (s,) that it is of.
         z: (s, 2) rad, m.
@@ -65,18 +72,36 @@ def _are_false(places: Array, poses: Array, image: IntArray, point: IntArray, z:
     usual_count = np.median(count[point])  # of points that most sightings are of
     pairs = points_in_sight(places, poses, image, z)
     shows = np.isin(pairs[:, 0] * n + pairs[:, 1], image * n + point)
-    begin, end = np.full(n, len(poses)), np.zeros(n, dtype=np.intp)
-    np.minimum.at(begin, point, image)
-    np.maximum.at(end, point, image)
-    meanwhile = (pairs[:, 0] >= begin[pairs[:, 1]]) & (pairs[:, 0] <= end[pairs[:, 1]])
-    at = pairs[:, 1]
-    times, hits, there, hits_there = (
-        np.bincount(at[which], minlength=n)
-        for which in (np.ones_like(shows), shows, meanwhile, shows & meanwhile)
-    )
+    times, hits = (np.bincount(pairs[of, 1], minlength=n) for of in (slice(None), shows))
     rates = hits / np.maximum(times, 1)
     often = count >= FEW * usual_count
     usual = np.median(np.repeat(rates[often], count[often]))
     seldom = bdtr(hits, times, SELDOM * usual) < CHANCE
-    stayed = (hits_there >= FOR_A_WHILE) & (hits_there >= SELDOM * usual * there)
-    return np.asarray(seldom & ~often & ~stayed)
+    suspect = seldom & ~often
+    asked = suspect[pairs[:, 1]]
+    pairs, shows = pairs[asked], shows[asked]
+    stayed = _in_stays(pairs[:, 1], robot[pairs[:, 0]], shows, SELDOM * usual, n) >= FOR_A_WHILE
+    return np.asarray(suspect & ~stayed)
+
+
+def _in_stays(point: IntArray, robot: IntArray, shows: BoolArray, rate: float, n: int) -> IntArray:
+    """How many sightings each of n points has in stays, in which it is seen at a ``rate`` or more.
+
+    Args:
+        point: (k,) of images that should show it, of each robot in the order of time.
+        robot: (k,) whose image it is.
+        shows: (k,) whether it does.
+        rate: least share of the images of a stay.
+        n: number of points.
+    """
+    order = np.lexsort((np.arange(len(point)), robot, point))
+    at = np.flatnonzero(shows[order])
+    if not len(at):
+        return np.zeros(n, dtype=np.int64)
+    whose = np.column_stack([point, robot])[order][at]
+    begins = np.append(True, (np.diff(whose, axis=0) != 0).any(axis=1) | (np.diff(at) > GONE))
+    first = np.flatnonzero(begins)
+    hits = np.diff(np.append(first, len(at)))
+    images = at[first + hits - 1] - at[first] + 1
+    counts = (hits >= STAY) & (hits >= rate * images)
+    return np.bincount(whose[first, 0], hits * counts, minlength=n).astype(np.int64)

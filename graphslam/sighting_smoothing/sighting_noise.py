@@ -10,10 +10,11 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from graphslam.core.arrays import BoolArray, IntArray
 from graphslam.core.config import Config
 from graphslam.core.geometry import Array
 from graphslam.core.record import replace
-from graphslam.core.records import Estimate, Sighting, Start, Step
+from graphslam.core.records import Association, Estimate, Sighting, Start, Step
 from graphslam.estimation.calibration_graph import CalibrationGraph
 from graphslam.estimation.log_noise import MOTION, LogNoise, has_state_at_every_sighting, is_white
 from graphslam.estimation.motion_noise import (
@@ -38,6 +39,7 @@ from graphslam.sighting_smoothing.sighting_states import (
 )
 from graphslam.sighting_smoothing.unstated_noise import (
     MIN_MEASUREMENTS,
+    MIN_VARIANCE,
     likelier_ranges,
     sigmas_of,
     unstated_sources,
@@ -46,6 +48,9 @@ from graphslam.sighting_smoothing.unstated_noise import (
 
 #: sightings in the stretch, about
 MAX_SIGHTINGS = 5000
+#: m or rad: a robot moves if it has driven or turned by so much since the image before. Where more
+#: than this share are of standing robots, these are left out, if so many others are left
+MOVED, MOST_STANDING, FEWEST_MOVING = 1e-3, 0.5, 300
 #: rounds at most; the noise has converged when no variance changes by a larger share
 MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
 #: where odometry is taken for less noisy than it is, errors seem to be shared: this is looked at
@@ -53,8 +58,6 @@ MAX_ROUNDS, CONVERGED_SHARE = 8, 0.1
 UNSETTLED_SHARE = 1.0
 #: relative decrease of the error at which optimisation ends: variances are known to some per cent
 CONVERGED_ERROR = 5e-4
-#: smallest factor on a stated variance on the way, for logs without noise
-MIN_VARIANCE = 1e-4
 #: rad: a bearing that is stated to be less certain was not measured
 UNKNOWN_BEARING_RAD = 1.0
 
@@ -82,12 +85,14 @@ def estimate_noise(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    chosen = stretch(steps)
+    chosen = _chosen(steps, sources, tracks)
     sample = steps_at_sightings(chosen, sources, {}, Counter())
     tracks = {name: tracks[name] for name in state_times(sample)}
     estimate = at_states(estimate, sample, tracks)
     before = {name: track.config for name, track in tracks.items()}
-    unstated = unstated_sources(sample, sources)
+    seen = {(a.robot, a.model) for step in sample for a in step.associations}
+    # of the whole log: a source that states its noise elsewhere is one that does
+    unstated = {k: own for k, own in unstated_sources(steps, sources).items() if k in seen}
     try:
         noise, last = _estimated(sample, estimate, tracks, config, rounds, unstated)
         sigmas = {
@@ -120,6 +125,49 @@ def noise_of_pass(one: LogPass, estimate: Estimate) -> LogNoise:
         noise = estimate_noise(one.steps, one.sources, estimate, tracks, one.config)
     one.noise = noise.to_summary()
     return noise
+
+
+def _chosen(
+    steps: Sequence[Step], sources: Sequence[Sighting], tracks: Mapping[str, Track]
+) -> tuple[Step, ...]:
+    """The `stretch` by which noise is measured: where robots move, if elsewhere they mostly stand.
+
+    A robot that stands sees the same again and again, and what its detector rounds or repeats looks
+    like no noise at all.
+    """
+    chosen, still = stretch(steps), _seen_standing(steps, sources, tracks)
+    of_chosen, of_all = still[_numbers(chosen)], still[_numbers(steps)]
+    if of_chosen.sum() <= MOST_STANDING * len(of_chosen) or (~of_all).sum() < FEWEST_MOVING:
+        return chosen
+
+    def moving(a: Association) -> bool:
+        return a.source is None or not still[a.source]
+
+    return stretch([replace(s, associations=tuple(filter(moving, s.associations))) for s in steps])
+
+
+def _seen_standing(
+    steps: Sequence[Step], sources: Sequence[Sighting], tracks: Mapping[str, Track]
+) -> BoolArray:
+    """Which of all sightings (n,) are of a robot that has not moved since its image before."""
+    still, numbers = np.zeros(len(sources), dtype=np.bool_), _numbers(steps)
+    times = np.array([sources[k].time_ns for k in numbers.tolist()], dtype=np.int64)
+    robots = np.array([sources[k].robot for k in numbers.tolist()])
+    for robot, track in tracks.items():
+        own = np.flatnonzero(robots == robot)
+        if not len(own):
+            continue
+        images, image = np.unique(times[own], return_inverse=True)
+        way = np.abs(np.diff(track.driven(images), axis=0)).sum(axis=1).cumsum() // MOVED
+        stood = np.append(False, np.diff(way, prepend=0.0) == 0.0)
+        still[numbers[own]] = stood[image]
+    return still
+
+
+def _numbers(steps: Sequence[Step]) -> IntArray:
+    """Of the sightings in steps (k,)."""
+    own = [a.source for step in steps for a in step.associations if a.source is not None]
+    return np.array(own, dtype=np.int64)
 
 
 def stretch(steps: Sequence[Step]) -> tuple[Step, ...]:

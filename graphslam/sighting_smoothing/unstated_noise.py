@@ -17,6 +17,9 @@ from graphslam.estimation.recorded_graph import Source
 
 #: sightings without which nothing is said about a source
 MIN_MEASUREMENTS = 100
+#: smallest factor on a variance: residuals of logs without noise, or of sightings that are rounded
+#: and repeated, vanish
+MIN_VARIANCE = 1e-4
 
 
 def unstated_sources(steps: Sequence[Step], sources: Sequence[Sighting]) -> dict[Source, list[int]]:
@@ -63,7 +66,7 @@ def likelier_ranges(
         )
         normalised = posterior.sightings(source).normalised[:, 1]
         model = likelier_range_noise(ranges, normalised * np.sqrt(present), present)
-        if model is not None:
+        if model is not None and (model.variance(ranges) >= MIN_VARIANCE * present).all():
             models[source] = model
     return models
 

@@ -131,7 +131,8 @@ class Evidence:
     """What the whole run knows; ``summary`` has what it counted.
 
     ``without_odometry``: robots whose motion is that of their scans. ``observed``: whether an
-    observation or a closure is in the estimate. ``closures``: how well these fit; None without.
+    observation or a closure is in the estimate; ``unobserved``: robots of which none is, neither by
+    them nor of them. ``closures``: how well these fit; None without.
     ``told``: the starts that the user gave. ``displacements`` of visits from
     where walls of the building were seen before. ``kernel`` of the last solution.
     """
@@ -141,6 +142,7 @@ class Evidence:
     innovations: Mapping[str, Array] = field(default_factory=dict)
     without_odometry: tuple[str, ...] = ()
     observed: bool = True
+    unobserved: tuple[str, ...] = ()
     closures: ClosureMisfits | None = None
     told: tuple[ToldStart, ...] = ()
     displacements: Mapping[str, Displacement] = field(default_factory=dict)
@@ -210,14 +212,26 @@ def gather(
                 skew=sweep_skew(own, scans.get(name, []), estimate, run.track),
             )
         )
-    observed = any(step.associations or step.closures for step in steps)
+    observed = _observed(steps)
+    unobserved = tuple(sorted(robots.keys() - observed))
     by_scans_alone = tuple(pipeline.log.without_odometry)
     misfits = _closure_misfits(steps, estimate)
     told = told_starts(pipeline, steps, estimate)
     return Evidence(
-        tuple(found), summary, innovations, by_scans_alone, observed, misfits, told,
-        pipeline.displacements, pipeline.kernel,
+        tuple(found), summary, innovations, by_scans_alone, bool(observed), unobserved,
+        misfits, told, pipeline.displacements, pipeline.kernel,
     )  # fmt: skip
+
+
+def _observed(steps: Sequence[Step]) -> set[str]:
+    """Robots that see something, are seen, or are at an end of a closure."""
+    found = set[str]()
+    for step in steps:
+        for a in step.associations:
+            found.update((a.robot, a.target) if isinstance(a.target, str) else (a.robot,))
+        for closure in step.closures:
+            found.update((closure.robot, closure.other))
+    return found
 
 
 def _closure_misfits(steps: Sequence[Step], estimate: Estimate) -> ClosureMisfits | None:

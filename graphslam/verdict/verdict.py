@@ -255,6 +255,14 @@ def _unobserved(evidence: Evidence) -> Iterable[Reason]:
             return
         text = "no landmark and no closure entered the estimate: this is dead reckoning by odometry"
         yield Reason("doubtful", "observations", "", text)
+        return
+    for name in evidence.unobserved:
+        if name not in evidence.without_odometry:
+            text = (
+                f"{name}: nothing that it saw, and nobody who saw it, entered the estimate: it is "
+                "where its odometry says"
+            )
+            yield Reason("doubtful", "observations", name, text)
 
 
 #: what is looked at, in the order in which it is told

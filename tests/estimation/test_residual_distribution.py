@@ -75,3 +75,10 @@ def test_a_shared_error_that_is_not_there_is_not_found():
     for seed in range(20):
         found = shared_variance(shared_residuals(0.0, 1.0, 0.05, seed=seed))
         np.testing.assert_array_equal(found, 0.0)
+
+
+def test_residuals_that_are_all_zero_have_a_finite_distribution():
+    """Of a robot that stands, whose detector rounds: each sighting is the same."""
+    for r in (np.zeros((200, 2)), np.column_stack([np.zeros(200), np.ones(200)])):
+        found = fit_distribution(r)
+        assert np.isfinite(found.variance).all() and np.isfinite(found.kernel_scale)

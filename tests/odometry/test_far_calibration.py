@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from graphslam.core.config import OdometryConfig
 from graphslam.core.geometry import compose
@@ -14,7 +15,7 @@ from graphslam.odometry.contradicted_motions import (
     ContradictedMotions,
     without_explained,
 )
-from graphslam.odometry.far_calibration import FAR_SIGMAS, explain, far_from_prior, widened
+from graphslam.odometry.far_calibration import FAR_SIGMAS, T_DOF, explain, far_from_prior, widened
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.scan_odometry import CONTRADICTION_D2
 from tests.odometry.test_online_calibration import CENTRED, NOTHING, Drive, weaving
@@ -138,6 +139,17 @@ def test_a_prior_is_wider_only_for_the_odometry_and_only_beyond_its_tails():
         assert (found.cov[at, at] > PRIOR.cov[at, at]) == wider
         others = np.arange(len(mean)) != at
         np.testing.assert_array_equal(np.diag(found.cov)[others], np.diag(PRIOR.cov)[others])
+
+
+def test_the_pull_of_a_wider_prior_is_that_of_a_student_distribution():
+    """The slope of the negative logarithm of its density, by differences, at the value found."""
+    at, sigma = PRIOR.names.index("rotation_scale"), 5.0
+    spread = float(np.sqrt(PRIOR.cov[at, at]))
+    mean = np.zeros(len(PRIOR.names))
+    mean[at] = sigma * spread
+    found = widened(PRIOR, replace(PRIOR, mean=mean))
+    cost = -stats.t.logpdf(sigma + np.array([-1e-4, 1e-4]), T_DOF)
+    assert mean[at] / found.cov[at, at] * spread == pytest.approx(np.diff(cost)[0] / 2e-4, rel=1e-6)
 
 
 def test_a_log_is_read_again_only_for_odometry_far_off_and_with_doubt_in_what_was_found():

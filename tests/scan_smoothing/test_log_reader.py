@@ -7,13 +7,15 @@ from paths import LOGS
 
 from graphslam.core.config import KeyframeConfig
 from graphslam.core.config_io import load_config
-from graphslam.core.records import TRUE_RECORDS, Scan
+from graphslam.core.record import packed
+from graphslam.core.records import TRUE_RECORDS, Scan, Truth
 from graphslam.core.worker import allow_fork
 from graphslam.logs import open_logs
 from graphslam.pipeline.keyframes import KeyframeSelector
 from graphslam.pipeline.robot_settings import make_tracks
 from graphslam.pipeline.robot_state import RobotState
 from graphslam.pipeline.synchronisation import synchronise
+from graphslam.scan_smoothing import log_reader
 from graphslam.scan_smoothing.log_reader import read_ahead
 
 
@@ -37,6 +39,30 @@ def test_messages_are_taken_from_the_reading_that_has_begun(tmp_path, second):
             assert log.report() == expected.report()
     finally:
         allow_fork(second=False)
+
+
+def test_batches_are_asked_for_ahead_but_not_more_than_a_pipe_holds(monkeypatch):
+    """All of a long log's at once would fill the pipe while the second process fills its own."""
+    monkeypatch.setattr(log_reader, "MOST_AHEAD", 5)
+
+    class Asked:
+        ahead, most, left = 0, 0, 40
+
+        def send(self, _value):
+            self.ahead += 1
+            self.most = max(self.most, self.ahead)
+
+        def receive(self):
+            self.ahead -= 1
+            self.left -= 1
+            return (
+                packed([Truth("r", self.left, self.left, np.zeros(3))]) if self.left >= 0 else None
+            )
+
+    asked = Asked()
+    found = list(log_reader._received(asked, 40))
+    assert [message.time_ns for message in found] == list(range(39, -1, -1))
+    assert asked.most == 5
 
 
 def test_keyframes_of_a_block_are_those_found_one_by_one():

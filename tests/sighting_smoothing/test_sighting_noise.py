@@ -8,6 +8,7 @@ import pytest
 
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import Array, between, compose, exp, wrap
+from graphslam.core.records import OdometryPose, Sighting
 from graphslam.logs import LogWriter, open_logs
 from graphslam.logs.sighting_covariances import BEARING_RAD, RANGE_M, RANGE_SHARE
 from graphslam.sighting_smoothing import sighting_noise
@@ -373,6 +374,70 @@ def test_few_sightings_that_state_no_noise_have_what_is_common(tmp_path):
     assert sigmas == pytest.approx(
         {"bearing_rad": BEARING_RAD, "range_m": RANGE_M, "range_share": RANGE_SHARE}
     )
+
+
+def parked(world, readings):
+    """The world with a stop at half of the drive, where the same five are seen again and again."""
+    k, n = len(world.twists) // 2, readings
+    x = world.poses[k]
+    apart = world.landmarks - x[:2]
+    z = np.column_stack([wrap(np.arctan2(*apart.T[::-1]) - x[2]), np.hypot(*apart.T)])
+    near = np.argsort(z[:, 1])[:5].tolist()
+    still = [(k + j, i, z[i].round(2)) for j in range(1, n + 1) for i in near]
+    seen = [one for one in world.seen if one[0] <= k], [one for one in world.seen if one[0] > k]
+    return World(
+        np.concatenate([world.poses[: k + 1], np.tile(x, (n, 1)), world.poses[k + 1 :]]),
+        np.concatenate([world.twists[:k], np.zeros((n, 3)), world.twists[k:]]),
+        [*seen[0], *still, *((j + n, i, one) for j, i, one in seen[1])],
+        world.landmarks,
+        world.start,
+    )
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_noise_is_measured_where_the_robot_moves(tmp_path, named):
+    """What a detector rounds does not change while the robot stands, for most of the sightings: it
+    seemed to have no noise, and the estimate was indeterminate."""
+    world = parked(simulate(1), 1400)
+    result = solved(
+        tmp_path / "log.mcap", world, increments=False, cov=np.zeros((2, 2)), named=named
+    )
+    sigmas = result.summary["noise"]["robot point"]["sigmas"]
+    # as where nobody stands, see above; points without names take up a little more
+    assert sigmas["bearing_rad"] == pytest.approx(SIGHTING[0], rel=0.1)
+    assert judge(result, world)[0] < 0.05
+    assert result.summary["verdict"]["verdict"] == "good"
+
+
+def test_sightings_without_any_noise_at_all_end_no_run(tmp_path):
+    """A robot that hardly moves: residuals vanish wherever its noise is looked for."""
+    world = parked(simulate(1, seconds=4.0), 300)
+    result = solved(tmp_path / "log.mcap", world, increments=False, cov=np.zeros((2, 2)))
+    assert np.isfinite(result.robots["robot"].final.covs).all()
+
+
+def test_noise_that_some_sightings_state_is_stated(tmp_path, monkeypatch):
+    """Also if none of those does by which it is measured, in the middle of the log."""
+    monkeypatch.setattr(sighting_noise, "MAX_SIGHTINGS", 500)
+    world = simulate(1)
+    path = tmp_path / "log.mcap"
+    first = replace(world, seen=world.seen[:300])
+    rest = replace(world, seen=world.seen[300:])
+    write(path, first, increments=False)
+    later = write(tmp_path / "later.mcap", rest, increments=False, cov=np.zeros((2, 2)))
+    with LogWriter(tmp_path / "both.mcap") as log:
+        for name, kinds in ((path, OdometryPose | Sighting), (later, Sighting)):
+            for message in open_logs([name], load_config()).messages():
+                if not isinstance(message, kinds):
+                    continue
+                if isinstance(message, OdometryPose):
+                    log.odometry("robot", message.stamp_ns, message.pose)
+                    continue
+                cov = message.cov if message.stated else np.zeros((2, 2))
+                log.sighting("robot", message.stamp_ns, message.z, cov, identity=message.identity)
+    result = smooth(open_logs([tmp_path / "both.mcap"], load_config()), load_config())
+    assert "stated" not in result.summary["noise"]["robot point"]
+    assert result.summary["verdict"]["verdict"] == "good"
 
 
 def test_causal_poses_use_the_noise_that_is_not_stated(tmp_path):

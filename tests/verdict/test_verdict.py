@@ -588,6 +588,14 @@ def test_what_saw_much_and_used_nothing_is_dead_reckoning():
     assert verdict == "doubtful" and "dead reckoning" in told
 
 
+def test_a_robot_that_nothing_was_seen_by_or_of_is_named():
+    """The others' landmarks say nothing of it; one without odometry is where its scans say."""
+    alone = replace(evidence(), unobserved=("tom",))
+    verdict, told = reasons(alone)
+    assert verdict == "doubtful" and "tom: nothing that it saw" in told
+    assert reasons(replace(alone, without_odometry=("tom",)))[0] == "good"
+
+
 def test_a_back_end_without_observations_is_not_said_to_contradict_them():
     graph = {"graph": {"error_without_kernels": 4e5, "dof": 0}}
     assert reasons(replace(evidence(), summary=SUMMARY | graph))[0] == "good"
