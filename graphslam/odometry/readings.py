@@ -26,8 +26,9 @@ Odometry = OdometryPose | OdometryIncrement | WheelAngles
 RESET_SPEED_RATIO, SHORTEST_RESET_NS, RESET_SLACK_M = 0.5, 10_000_000, 0.5
 #: share of readings in bursts above which the stamps are not good enough to learn a latency
 MAX_BURST_SHARE = 0.01
-#: ns: how long before the first reading or after the last a robot is taken to stand
-EDGE_NS = 500_000_000
+#: ns: how long before the first reading or after the last a robot is taken to stand; one that moves
+#: until a second reading is due or, if that is later, until it is so far away, m (turning: effort)
+EDGE_NS, STANDS_M, PERIODS = 500_000_000, 1e-3, 32
 #: readings that wait for integration at most: each is an array until then
 MOST_PENDING = 50_000
 #: readings of one robot that are integrated one by one at most: arrays take as long as eight do
@@ -60,24 +61,21 @@ class RowSpan:
 
 
 class Readings:
-    """Odometry readings of one robot, in time order.
+    """Odometry readings of one robot, in time order, each as one small row of what it adds.
 
-    One small row per reading is kept: what its interval adds (a twist or wheel turns with the
-    seconds in motion, or an increment with its covariance).
+    That is a twist or wheel turns with the seconds in motion, or an increment with its covariance.
     """
 
     def __init__(self, config: OdometryConfig, robot: RobotConfig) -> None:
         """No readings yet."""
         self.source = ""
         #: readings that were made of scans where there were none, see `gap_bridging`
-        self.bridged = 0
-        self.bridged_sigma_m = 0.0
+        self.bridged, self.bridged_sigma_m = 0, 0.0
         #: what increments leave out
         self.missing = MissingIncrements()
         self.config, self.robot = config, robot
-        self._count, self._bursts, self._resets = 0, 0, 0
-        self._forgotten = 0  # readings, see `forget_before`
-        self._integrated = 0  # readings that are integrated; the others' values wait in `_pending`
+        # values of readings that are not integrated yet wait in `_pending`
+        self._count = self._bursts = self._resets = self._forgotten = self._integrated = 0
         self._pending: list[Array] = []
         self._times = np.empty(1024, dtype=np.int64)  # time of the end of each row's interval
         self._rows = np.empty((1024, 0))
@@ -247,7 +245,7 @@ class Readings:
         i = int(self.times.searchsorted(time_ns))
         if 0 < i < self._count:
             return bool(self._times[i] - self._times[i - 1] <= gap_ns)
-        return self.first_ns <= time_ns <= self.last_ns + EDGE_NS
+        return self.first_ns <= time_ns <= self._end_ns()
 
     def covers_each(self, times_ns: IntArray, gap_ns: int) -> BoolArray:
         """`covers` of many times (n,)."""
@@ -255,8 +253,15 @@ class Readings:
             return np.zeros(len(times_ns), dtype=np.bool_)
         i = self.times.searchsorted(times_ns)
         before, after = (self.times[k.clip(0, self._count - 1)] for k in (i - 1, i))
-        near = (self.first_ns <= times_ns) & (times_ns <= self.last_ns + EDGE_NS)
+        near = (self.first_ns <= times_ns) & (times_ns <= self._end_ns())
         return np.asarray(np.where((i > 0) & (i < self._count), after - before <= gap_ns, near))
+
+    def _end_ns(self) -> int:
+        """Until when the robot is where the last reading says, see `EDGE_NS`."""
+        recent = self.times[-PERIODS - 1 :]
+        period_ns = int(recent[-1] - recent[0]) // max(len(recent) - 1, 1)
+        moved = max(float(np.diff(self.effort(self.last_ns - np.array([period_ns, 0])))[0]), 1e-9)
+        return self.last_ns + min(EDGE_NS, round(max(period_ns, 1000) * max(2.0, STANDS_M / moved)))
 
     def pose(self, times_ns: IntArray | int) -> Array:
         """Poses (..., 3) by odometry alone, in the frame of the first reading.

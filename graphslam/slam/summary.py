@@ -280,7 +280,7 @@ def _unplaced_warnings(pipeline: LogPass) -> list[str]:
         return []
     return [
         f"{count} of {count + used} scans were left out: no odometry is near them, as where it "
-        "begins late"
+        "begins late or ends early"
     ]
 
 

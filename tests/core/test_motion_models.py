@@ -494,8 +494,8 @@ def test_reaches_and_near_tell_what_odometry_covers():
     # between readings: they are no farther apart than the gap
     assert track.covers(10 * SECOND + 1, SECOND) and not track.covers(12 * SECOND, SECOND)
     assert track.covers(12 * SECOND, 3 * SECOND)
-    # after: the robot is taken to stand for half a second, whatever the gap; before: not at all,
-    # as its start is where its odometry begins
+    # after: until a second reading is due, half a second at most; before: not at all, as its start
+    # is where its odometry begins
     first, last = 10 * SECOND, 14 * SECOND + EDGE_NS
     assert track.covers(first, 9 * SECOND) and track.covers(last, 9 * SECOND)
     assert not track.covers(first - 1, 9 * SECOND) and not track.covers(last + 1, 9 * SECOND)
@@ -506,6 +506,18 @@ def test_reaches_and_near_tell_what_odometry_covers():
         one_by_one = [track.covers(t, gap_ns) for t in times.tolist()]
         assert track.covers_each(times, gap_ns).tolist() == one_by_one
     assert not Track(NOISE, EVEN).covers_each(times, SECOND).any()
+    # one that stands at last is taken to stand for half a second, whatever the gap
+    for ends in ([1, 0, 0], [1, 0, 1e-9]):
+        still = odometry_track([10, 11, 14], [[0, 0, 0], [1, 0, 0], ends])
+        assert still.covers(14 * SECOND + EDGE_NS, SECOND)
+        assert not still.covers(14 * SECOND + EDGE_NS + 1, SECOND)
+    # for two of the periods of 20 ms, or until it is a millimetre away
+    for step, covered_s in (([0.01, 0, 0], 0.04), ([0, 0, 0.1], 0.04), ([0.0001, 0, 0], 0.2)):
+        moving = odometry_track([10 + 0.02 * k for k in range(51)], np.outer(range(51), step))
+        for seconds in (0.9 * covered_s, 1.1 * covered_s):
+            assert moving.covers(round((11 + seconds) * SECOND), SECOND) == (seconds < covered_s)
+    alone = odometry_track([10], [[0, 0, 0]])
+    assert alone.covers(10 * SECOND + EDGE_NS, SECOND)
 
 
 @pytest.mark.parametrize("source", ["poses", "wheels"])

@@ -139,11 +139,18 @@ def test_one_robots_silence_delays_the_others_by_the_gap_at_most():
 
 
 def test_what_is_near_odometry_at_the_end_of_the_log_is_released_and_the_rest_counted():
-    """After its last reading a robot is taken to stand, for half a second and no longer."""
-    messages = [odometry("a", 0), odometry("a", 1), scan("a", 1.2), scan("a", 1.5), scan("a", 1.6)]
-    run = Run(messages)
-    assert run.times(Scan) == [1.2, 1.5]
+    """After its last reading a robot that stands is taken to stand on, for half a second and no
+    longer. One that moves, by readings every 0.1 s, is elsewhere: its scans would be laid where it
+    was."""
+    scans = [scan("a", 2.2), scan("a", 2.5), scan("a", 2.6)]
+    stands = replace(odometry("a", 1), stamp_ns=2 * SECOND, time_ns=2 * SECOND)
+    run = Run([odometry("a", 0), odometry("a", 1), stands, *scans])
+    assert run.times(Scan) == [2.2, 2.5]
     assert run.dropped == {"scan: no odometry near it": 1}
+    moves = [odometry("a", 0.1 * k) for k in range(21)]
+    run = Run([*moves, scan("a", 2.09), *scans])
+    assert run.times(Scan) == [2.09, 2.2]
+    assert run.dropped == {"scan: no odometry near it": 2}
 
 
 def test_scans_before_the_first_odometry_are_counted():
