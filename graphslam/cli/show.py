@@ -199,6 +199,8 @@ def mapped(made: Mapping[str, Any], directory: Path) -> None:
             f"grid map: {width:.1f} x {height:.1f} m, cells of {_number(grid['resolution_m'])} m, "
             f"{_number(grid['occupied'])} occupied, {_number(grid['free'])} free"
         )
+    if made["verdict"] in ("doubtful", "bad"):
+        console.print(f"warning: the verdict on the result is {made['verdict']}: see its report")
     console.print(f"in {directory}: {', '.join(made['files'])}")
 
 

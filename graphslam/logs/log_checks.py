@@ -185,11 +185,20 @@ def _gaps(log: CheckedLog) -> Iterable[Finding]:
         text = f"{len(topic.gaps)} gaps, the longest {longest:.1f} s"
         remedy = ""
         if topic.schema in _MOVING and longest > log.config.odometry.max_gap_s:
-            remedy = "scans and sightings in gaps longer than odometry.max_gap_s are dropped: "
-            remedy += f"--set odometry.max_gap_s={longest + 0.1:.1f}"
+            if _is_scanned(log, topic, longest):
+                remedy = "scans bridge it, which is less sure: record odometry throughout"
+            else:
+                remedy = "scans and sightings in gaps longer than odometry.max_gap_s are dropped: "
+                remedy += f"--set odometry.max_gap_s={longest + 0.1:.1f}"
             if log.recordings > 1:
                 remedy += "; recordings that are drives of their own: smooth --same-place"
         yield Finding("doubt" if topic.used else "note", "gaps", topic.name, text, remedy)
+
+
+def _is_scanned(log: CheckedLog, moving: TopicInfo, gap_s: float) -> bool:
+    """Whether a laser of the robot went on while odometry ``moving`` was missing for so long."""
+    scans = [t for t in log.used if t.schema in _SCANS and t.robot == moving.robot]
+    return any(max((gap.duration_s for gap in t.gaps), default=0.0) < gap_s / 2 for t in scans)
 
 
 def _rates(log: CheckedLog) -> Iterable[Finding]:

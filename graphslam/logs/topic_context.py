@@ -46,6 +46,8 @@ _STAMPED = (records.Scan, records.Sighting, records.OdometryPose, records.WheelA
 _SENSING = (records.Scan, records.Sighting)
 #: share of the poses in which a base leans that are too many to be bumps
 SHARE_LEANING = 0.05
+#: the last beam is elsewhere than stated by more than so many beams, and this share of the field
+ODD_BEAMS, ODD_SHARE = 2.0, 0.01
 #: bearings beyond the largest, how many at least and of all: they are no radians
 LEAST_IN_DEGREES, SHARE_IN_DEGREES = 10, 0.25
 #: rad: that is a turn, rounded as drivers do; the beams of a scan may begin up to a turn from ahead
@@ -213,12 +215,12 @@ class _SensorFrames:
             bearings = [float(m.bearing) for m in messages]
             findings += in_degrees(topic.name, bearings, "their variance * (pi / 180)^2")
         if topic.schema == schemas.LASER_SCAN:
-            first, step = (
+            first, step, stated = (
                 np.array([getattr(m, name) for m in messages])
-                for name in ("angle_min", "angle_increment")
+                for name in ("angle_min", "angle_increment", "angle_max")
             )
-            # angle_max is not what some drivers say
             last = first + step * [len(m.ranges) - 1 for m in messages]
+            findings += odd_spacing(topic.name, first, last, stated, step)
             findings += in_degrees(
                 topic.name, [*first, *last], "angle_increment too", MAX_SCAN_ANGLE_RAD
             )
@@ -334,6 +336,22 @@ def odd_limits(topic: str, limits: Array) -> list[Finding]:
     else:
         return []
     return [Finding("doubt", "units", topic, text, remedy)]
+
+
+def odd_spacing(topic: str, first: Array, last: Array, stated: Array, step: Array) -> list[Finding]:
+    """That angle_max, ``stated`` (n,), is not where beams end, ``last``: one of them is wrong.
+
+    Some drivers leave it zero, or a beam or two off; rad.
+    """
+    off = np.abs(stated - last)
+    odd = (off > ODD_BEAMS * np.abs(step)) & (off > ODD_SHARE * np.abs(last - first))
+    if not len(off) or np.mean(odd & (stated != 0.0)) <= 0.5:
+        return []
+    end, said = np.degrees([np.median(last), np.median(stated)])
+    text = (
+        f"beams end at {end:.1f}° by angle_increment and their number, at {said:.1f}° by angle_max"
+    )
+    return [Finding("doubt", "angles", topic, text, "check both: a wrong spacing bends the map")]
 
 
 def _is_unstamped(files: Sequence[Recording], topic: Topic) -> bool:

@@ -26,10 +26,14 @@ NAME = "map"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapFiles:
-    """Names and contents of the files of a map; ``grid`` is None without scans."""
+    """Names and contents of the files of a map; ``grid`` is None without scans.
+
+    ``verdict``: that of the result, None if it has none.
+    """
 
     files: tuple[tuple[str, str | bytes], ...]
     grid: GridMap | None
+    verdict: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """What ``graphslam map --json`` prints."""
@@ -44,7 +48,8 @@ class MapFiles:
                 "occupied": int(self.grid.occupied.sum()),
                 "free": int(self.grid.free.sum()),
             }
-        return {"files": [name for name, _ in self.files], "grid": grid}
+        files = [name for name, _ in self.files]
+        return {"files": files, "grid": grid, "verdict": self.verdict}
 
 
 def make_map(
@@ -116,4 +121,4 @@ def _map_files(
         ("landmarks.csv", csv_text(LANDMARK_COLUMNS, landmark_rows(landmarks))),
         ("trajectories.csv", csv_text(TRAJECTORY_COLUMNS, trajectory_rows(paths, frames))),
     ]
-    return MapFiles(tuple(files), grid)
+    return MapFiles(tuple(files), grid, summary.get("verdict", {}).get("verdict"))

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib.metadata import version
@@ -625,3 +626,17 @@ def test_map_makes_in_the_folder_what_smooth_makes_with_map(room, tmp_path):
     assert "cells of 0.02 m" in finer.out
     assert (tmp_path / "out/map.png").is_file()
     assert call("map", room.out, "--resolution", "0").code == 2
+
+
+def test_map_says_if_the_result_is_not_good(room, tmp_path):
+    """Who makes a map for navigation need not have read the report."""
+    target = tmp_path / "out"
+    shutil.copytree(room.out, target)
+    for verdict in ("good", "doubtful", "bad"):
+        summary = json.loads((target / "summary.json").read_text())
+        summary["verdict"]["verdict"] = verdict
+        (target / "summary.json").write_text(json.dumps(summary))
+        told = call("map", target, "-o", tmp_path / verdict).out
+        assert (f"verdict on the result is {verdict}" in told) == (verdict != "good")
+        made = call("map", target, "-o", tmp_path / verdict, "--force", "--json")
+        assert json.loads(made.out)["verdict"] == verdict

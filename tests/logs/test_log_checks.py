@@ -15,6 +15,7 @@ from graphslam.core.config import Config
 from graphslam.core.config_io import load_config
 from graphslam.core.errors import LogError
 from graphslam.logs import LogWriter, inspect_logs, open_logs, schemas
+from graphslam.logs.topic_context import odd_spacing
 
 S = 1_000_000_000
 T0 = 1_700_000_000 * S
@@ -205,6 +206,44 @@ def test_scans_in_degrees_are_refused_before_anything_is_computed(tmp_path):
     line = check_one_line(call("smooth", path, "-o", tmp_path / "out"))
     assert "bearings are in degrees: up to 90" in line and "angle_increment too" in line
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("stated_rad", "is_odd"),
+    [
+        (1.0, False),  # as it is
+        (1.1, False),  # a beam more, as some drivers have it
+        (0.0, False),  # left out
+        (1.25, True),
+        (-1.0, True),
+    ],
+)
+def test_an_angle_max_that_beams_do_not_end_at_is_asked_about(stated_rad, is_odd):
+    """A wrong angle_increment bends a map by far more than is stated, without a word. 21 beams from
+    -1 rad on, 0.1 rad apart."""
+    n = np.ones(5)
+    found = odd_spacing("/scan", -n, n, stated_rad * n, 0.1 * n)
+    assert [finding.severity for finding in found] == is_odd * ["doubt"]
+    assert not odd_spacing("/scan", n[:0], n[:0], n[:0], n[:0])
+
+
+@pytest.mark.parametrize("scanned", [False, True])
+def test_a_gap_of_odometry_that_scans_bridge_is_not_to_be_taken_for_motion(tmp_path, scanned):
+    """A longer odometry.max_gap_s makes one straight motion of 30 s; scans at least go on."""
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as log:
+        log.mount("robot", T0, (0, 0, 0))
+        for k in range(600):
+            stamp = T0 + k * S // 10
+            gone = 100 <= k < 400
+            if not gone:
+                log.odometry("robot", stamp, (0.01 * k, 0, 0))
+            if scanned or not gone:
+                shape = {"angle_min_rad": -1.0, "angle_step_rad": 0.1, "range_max_m": 8.0}
+                log.scan("robot", stamp, np.full(21, 2.0), **shape)
+    (finding,) = [f for f in inspect_logs([path], Config()).findings if "odom" in f.topic]
+    assert finding.check == "gaps"
+    assert ("odometry.max_gap_s" in finding.remedy) != scanned
 
 
 @pytest.mark.parametrize(
