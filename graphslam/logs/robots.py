@@ -96,6 +96,16 @@ class _Frames:
         """The odometry above ``frame`` in tf."""
         return find_chain(frame, *self.tree(space))
 
+    def only_chain(self, space: str) -> Chain | None:
+        """The odometry in tf, if there is one: what moves in a frame that is called odom."""
+        edges, static = self.tree(space)
+        bases = [
+            child
+            for child, edge in edges.items()
+            if edge.moves and "odom" in edge.parent.rsplit("/", 1)[-1]
+        ]
+        return find_chain(bases[0], edges, static) if len(bases) == 1 else None
+
 
 def _check_names(robots: Collection[str], files: Sequence[Recording], config: Config) -> None:
     """Check that there are not too many robots, and that their names can be those of files.
@@ -324,7 +334,8 @@ def _with_tf_odometry(
     findings: list[Finding] = []
     good = (records.OdometryIncrement, records.OdometryPose)
     moving = any(moving_topics(file) for file in files)
-    for robot in sorted({t.robot for t in topics if t.count and t.record in _SENSORS}):
+    robots = sorted({t.robot for t in topics if t.count and t.record in _SENSORS})
+    for robot in robots:
         own = [t for t in topics if t.robot == robot and t.count]
         if not moving or any(t.record in good for t in own):
             continue
@@ -332,6 +343,8 @@ def _with_tf_odometry(
         sensed = {frame_of(message) for message in sample_decoded(files, sensor)}
         chains = (frames.chain(frame, robot) for frame in sorted(sensed))
         chain = next(filter(None, chains), None)
+        if chain is None and len(robots) == 1:  # no transform leads from its base to a sensor
+            chain = frames.only_chain(robot)
         if chain is None:
             continue
         name, count = "", 0

@@ -321,6 +321,25 @@ def test_odometry_that_is_on_tf_only_gives_the_same_trajectory(scan, room, expec
     np.testing.assert_array_equal(found.final.poses, expected.poses)
 
 
+def test_odometry_on_tf_needs_no_transform_to_the_sensor(room, expected, tmp_path):
+    """Where the laser is can be told; the odometry was left out, and the laser's path was said to
+    be the base's."""
+
+    class Untied(Robot):
+        def transforms(self, topic, stamp, transforms):
+            if not topic.endswith("_static"):
+                super().transforms(topic, stamp, transforms)
+
+    path = record(tmp_path / "log.mcap", room, lambda log: {Untied(log): ("moving",)})
+    lines = open_logs([path], Config()).warnings
+    assert any("taken from /tf: base_footprint in odom" in line for line in lines)
+    assert any("tf_static has no transform from base_footprint" in line for line in lines)
+    mount = {"default": {"laser": MOUNT.tolist()}}
+    (found,) = graphslam.smooth(path, robots=mount).robots.values()
+    # the mount comes through two transforms, or as it is
+    np.testing.assert_allclose(found.final.poses, expected.poses, atol=1e-5)
+
+
 def test_odometry_on_tf_in_two_moving_hops_is_their_product(room, tmp_path):
     """odom -> platform -> base_footprint: as composed, and only when the last hop has come."""
     part = np.array([0.3, -0.2, 0.4])
