@@ -51,7 +51,8 @@ def checked_out(commit: str, folder: Path) -> None:
 
 def run(name: str, log: Path, packages: Mapping[str, Path], which: str, folder: Path) -> Used:
     """What a job costs with the package of this checkout (``now``) or with that of ``then``."""
-    command = [sys.executable, "-m", "graphslam", "smooth", str(log)]
+    # -P: not the package in the working directory
+    command = [sys.executable, "-P", "-m", "graphslam", "smooth", str(log)]
     command += ["-o", str(folder / f"{name}-{which}"), "--force", "--json", *OPTIONS.get(name, ())]
     return measured_process(command, {"PYTHONPATH": str(packages[which])})[1]
 

@@ -21,7 +21,7 @@ from graphslam.odometry.noise_estimation import CLIP_SIGMAS, SIGMA_OF_MEDIAN
 DEGREES_OF_FREEDOM = (2.0, 3.0, 5.0, 8.0, 13.0, 20.0, 35.0, 60.0)
 #: rounds of expectation maximisation, after which the scale changes by less than a thousandth
 ROUNDS = 12
-#: least factor on a variance: residuals that are all zero have a size all the same
+#: squared residuals, at least: those that are all zero have a size all the same
 LEAST_VARIANCE = 1e-12
 #: a shared error is significant if its variance is so many of the sigmas that it has by chance
 SIGNIFICANT_SIGMAS = 3.0
@@ -42,11 +42,12 @@ class ResidualDistribution:
 
 def fit_distribution(normalised: Array) -> ResidualDistribution:
     """The distribution of residuals (n, k), each divided by the sigma that it should have."""
-    fits = _fits(np.ascontiguousarray(np.square(normalised).T))
+    squared = np.maximum(np.square(normalised), LEAST_VARIANCE)
+    fits = _fits(np.ascontiguousarray(squared.T))
     best = int(fits.likelihood.argmax())
     variance, nu = fits.variance[best], DEGREES_OF_FREEDOM[best]
     k = normalised.shape[1]
-    d2 = np.square(normalised / np.sqrt(variance)).sum(axis=1)
+    d2 = (squared / variance).sum(axis=1)
     w = 1.0 / (1.0 + d2 / nu)
     slope = float(np.mean(w - 2.0 * w**2 * d2 / (nu * k)))
     factor = float(np.mean(w) * np.mean(w**2 * d2) / k / slope**2)
@@ -65,11 +66,10 @@ def _fits(squared: Array) -> _Fits:
     k, n = squared.shape
     nu = np.array(DEGREES_OF_FREEDOM)[:, None]
     # a median of squares of normal variables is 0.455
-    begin = np.maximum(np.median(squared, axis=1) / 0.455, LEAST_VARIANCE)
+    begin = np.median(squared, axis=1) / 0.455
     variance = np.tile(begin, (len(nu), 1))
     for _ in range(ROUNDS):
-        found = ((nu + k) / (nu + 1.0 / variance @ squared)) @ squared.T / n
-        variance = np.maximum(found, LEAST_VARIANCE)
+        variance = ((nu + k) / (nu + 1.0 / variance @ squared)) @ squared.T / n
     each = [
         math.lgamma((v + k) / 2) - math.lgamma(v / 2) - k / 2 * math.log(v * math.pi)
         for v in DEGREES_OF_FREEDOM

@@ -56,8 +56,6 @@ def read_ahead(log: LogSet, config: Config) -> Reading:
 
 def read_keyframes_ahead(log: LogSet, config: Config, known: Learnt | None = None) -> Reading:
     """Keyframes of a log for which `is_scan_log` holds; ``known``: see `read_keyframes`."""
-    import cv2  # noqa: F401, PLC0415 (front ends need it, which import it when they are called)
-
     from graphslam.scan_smoothing.scan_keyframes import read_keyframes  # noqa: PLC0415 (of scans)
 
     return Exchange(

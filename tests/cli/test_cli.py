@@ -555,7 +555,7 @@ def test_a_log_is_being_read_before_what_only_the_estimate_needs_is_imported(tmp
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     loaded = set(done.stderr.split())
     assert "graphslam.logs.mcap_file" in loaded
-    assert {"cv2", "scipy.spatial", "graphslam.scan_smoothing.scan_keyframes"} <= loaded
+    assert {"scipy.spatial", "graphslam.scan_smoothing.scan_keyframes"} <= loaded
     assert not loaded & {"gtsam", "scipy.optimize", "rich", "graphslam.results.folder"}
 
 
