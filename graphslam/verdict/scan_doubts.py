@@ -154,9 +154,9 @@ def _skewed(robot: RobotEvidence) -> Iterator[Reason]:
             f"{robot.name}: where it turns, the walls of a scan are turned against each other, as "
             f"by beams that are measured one after the other in {abs(skew.sweep_s):.2f} s or more "
             "and are taken as if otherwise: the map may be wrong by far more than is stated; set "
-            "time_increment of the scans and leave logs.undistort on (or, if it is set though beams "
-            "are measured at once, --set logs.undistort=false); see docs/logs.md, Motion during a "
-            "sweep"
+            "time_increment of the scans and leave logs.undistort on (or, if it is set though all "
+            "beams are measured at once, --set logs.undistort=false); see docs/logs.md, Motion "
+            "during a sweep"
         )
         yield Reason("doubtful", "scans", robot.name, text)
 
