@@ -85,12 +85,16 @@ def main() -> int:
     options.add_argument("--jobs", nargs="+", choices=list(LOGS), default=list(JOBS))
     options.add_argument("--repeats", type=int, default=5)
     given = options.parse_args()
-    commit = given.commit or baseline_commit()
     holds = True
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         packages = {"now": ROOT, "then": folder / "then"}
-        checked_out(commit, packages["then"])
+        try:
+            commit = given.commit or baseline_commit()
+            checked_out(commit, packages["then"])
+        except (OSError, subprocess.CalledProcessError) as error:
+            print(f"the earlier package is not to be had: {error}")
+            return 1
         print(f"now / {commit:8}{'wall time':>22}{'CPU time':>24}{'memory':>24}")
         for job in given.jobs:
             try:
