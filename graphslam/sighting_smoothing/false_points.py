@@ -94,7 +94,7 @@ def _in_stays(point: IntArray, robot: IntArray, shows: BoolArray, rate: float, n
         rate: least share of the images of a stay.
         n: number of points.
     """
-    order = np.lexsort((np.arange(len(point)), robot, point))
+    order = np.lexsort((robot, point))  # images of each stay in their order
     at = np.flatnonzero(shows[order])
     if not len(at):
         return np.zeros(n, dtype=np.int64)
