@@ -26,7 +26,7 @@ Odometry = OdometryPose | OdometryIncrement | WheelAngles
 RESET_SPEED_RATIO, SHORTEST_RESET_NS, RESET_SLACK_M = 0.5, 10_000_000, 0.5
 #: share of readings in bursts above which the stamps are not good enough to learn a latency
 MAX_BURST_SHARE = 0.01
-#: ns: how long before the first reading or after the last a robot is taken to stand; one that moves,
+#: ns: how long before the first reading or after the last a robot is taken to stand; one in motion
 #: for two periods (the mean of the last ones, so many) or, if longer, until it is so far away, m
 EDGE_NS, STANDS_M, PERIODS = 500_000_000, 1e-3, 32
 #: readings that wait for integration at most: each is an array until then
