@@ -76,23 +76,27 @@ class GrowingMcap:
             found[channel.topic] = kind
         return found
 
-    def messages(self) -> Iterator[RawMessage]:
-        """The messages that `poll` found and that were not given yet, translated."""
+    def new_blocks(self) -> Iterator[list[RawMessage]]:
+        """Messages that `poll` found and that were not given yet, translated, block by block."""
         channels = {}
         for number, channel in self._indexer.described().items():
             found = translation(channel.schema, channel.encoding)
             channels[number] = channel.topic, found.translate if found else None
-        blocks = self._indexer.blocks.blocks[self._given :]
-        self._given += len(blocks)
-        for block in blocks:
+        blocks = self._indexer.blocks.blocks
+        while self._given < len(blocks):
+            block, batch = blocks[self._given], []
+            self._given += 1
             for number, log_ns, data in block_messages(self._stream, block, channels.keys()):
                 topic, translate = channels[number]
-                yield RawMessage(topic, log_ns, translate(data) if translate else data)
+                batch.append(RawMessage(topic, log_ns, translate(data) if translate else data))
+            yield batch
 
     def batches(
         self, wait_s: float, idle: Callable[[], None] = lambda: None
     ) -> Iterator[list[RawMessage]]:
         """The messages as they come, until the file ends or has not grown for ``wait_s``.
+
+        One block at a time is in memory, however much was recorded before.
 
         ``idle``: called while there is nothing to read.
 
@@ -102,8 +106,7 @@ class GrowingMcap:
         grown = longer = time.monotonic()  # by records, and by bytes
         size = self._size()
         while True:
-            if batch := list(self.messages()):
-                yield batch
+            yield from self.new_blocks()
             if self.ended:
                 return
             if self._size() != size:
