@@ -253,6 +253,12 @@ def lying(m: Scan, factor: float) -> Scan:
     return replace(m, ranges=m.ranges * factor)
 
 
+def spaced(m: Scan, factor: float) -> Scan:
+    return replace(
+        m, angle_min_rad=factor * m.angle_min_rad, angle_step_rad=factor * m.angle_step_rad
+    )
+
+
 def mirrored_scan(m: Scan) -> Scan:
     return replace(m, ranges=m.ranges[::-1].copy())
 
@@ -313,6 +319,10 @@ def faults() -> dict[str, Fault]:
         )
         made[f"ranges of sightings in {name}"] = Fault(
             lambda m, k=scale: sighted(m, lambda a: replace(a, z=a.z * (1, k))), see, Sighting
+        )
+    for percent in (-2, 2):
+        made[f"beams {percent:+d} % apart"] = Fault(
+            lambda m, k=1 + 0.01 * percent: each(m, Scan, lambda a: spaced(a, k)), lid, Scan
         )
     made["odometry heading in degrees"] = Fault(
         lambda m: moved(m, lambda d, _: d * (1, 1, 57.3)), odo

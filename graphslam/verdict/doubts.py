@@ -1,4 +1,4 @@
-"""A reason to doubt a result, and what the checks that give reasons share."""
+"""Reasons to doubt a result, facts that are none, and what the checks share."""
 
 from dataclasses import dataclass
 
@@ -18,6 +18,19 @@ class Reason:
     level: str
     check: str
     about: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """What a user may want to know of a robot (``about``) though it is no reason for doubt.
+
+    ``check`` names what was looked at; ``share``: of the robot's sightings, if it is about these.
+    """
+
+    check: str
+    about: str
+    share: float | None
     text: str
 
 

@@ -25,7 +25,12 @@ from graphslam.pipeline.path_evidence import NO_PATH, PathMisfits
 from graphslam.pipeline.robot_state import RobotState
 from graphslam.pipeline.scan_evidence import Parked, find_parked
 from graphslam.verdict.curved_walls import curved_share
-from graphslam.verdict.sweep_skew import NO_SKEW, SweepSkew, by_robot, sweep_skew
+from graphslam.verdict.scan_distortion import (
+    UNDISTORTED,
+    ScanDistortion,
+    by_robot,
+    scan_distortion,
+)
 from graphslam.verdict.told_starts import ToldStart, told_starts
 
 IntTable = np.ndarray[tuple[int, int], np.dtype[np.int64]]
@@ -118,7 +123,7 @@ class RobotEvidence:
     missing: MissingIncrements = field(default_factory=MissingIncrements)
     lost_ns: IntTable = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     curved: float = 0.0
-    skew: SweepSkew = NO_SKEW
+    distortion: ScanDistortion = UNDISTORTED
 
     @property
     def other_sensor(self) -> str:
@@ -209,7 +214,7 @@ def gather(
                 bridged_sigma_m=run.track.bridged_sigma_m,
                 lost_ns=np.array(run.lost, dtype=np.int64).reshape(-1, 2),
                 curved=curved_share(own),
-                skew=sweep_skew(own, scans.get(name, []), estimate, run.track),
+                distortion=scan_distortion(own, scans.get(name, []), estimate, run.track),
             )
         )
     observed = _observed(steps)

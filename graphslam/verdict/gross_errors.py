@@ -16,7 +16,7 @@ from graphslam.core.arrays import BoolArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, polar_points, transform_each
 from graphslam.estimation.m_estimators import WEIGHTS
-from graphslam.verdict.doubts import MOVED_M, Reason
+from graphslam.verdict.doubts import MOVED_M, Fact, Reason
 from graphslam.verdict.evidence import Evidence, Seen
 from graphslam.verdict.moved_points import APART
 
@@ -35,18 +35,6 @@ LOOSER = 2.0
 #: sightings in a stretch, and how likely any of all stretches may look like that by chance
 STRETCHES = (5, 10, 20, 50, 100, 200)
 CHANCE = 0.01
-
-
-@dataclass(frozen=True, slots=True)
-class Fact:
-    """What a user may want to know of a robot (``about``) though it is no reason for doubt.
-
-    ``share`` of its sightings.
-    """
-
-    about: str
-    share: float
-    text: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,4 +156,4 @@ def _fact(robot: str, found: GrossErrors) -> Fact:
         text += ", too many to be harmless"
     else:
         text += f", {number - harmless} of {number} not by themselves"
-    return Fact(robot, number / n, text)
+    return Fact("gross_errors", robot, number / n, text)

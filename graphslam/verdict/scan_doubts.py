@@ -8,6 +8,7 @@ from graphslam.core.arrays import BoolArray
 from graphslam.core.geometry import Array, between
 from graphslam.verdict.doubts import MOVED_M, MOVED_RAD, Reason, seconds
 from graphslam.verdict.evidence import Evidence, IntTable, RobotEvidence
+from graphslam.verdict.scan_distortion import Distortion
 
 #: times that one scan is repeated while odometry moves: not just sent twice
 REPEATED = 5
@@ -19,9 +20,9 @@ HOPS = 0.3
 CONTRADICTED, IN_A_ROW, ROW = 0.12, 8, 12
 #: share of what was seen of walls that is of curves: of Intel and ACES up to 0.04
 CURVED = 0.15
-#: sigmas, share of the squared residuals, and rad: of walls turned within scans by a sweep; of
-#: healthy logs up to 7 sigmas, 0.03 and 0.004 rad
-SKEW_SIGMAS, SKEW_SHARE, SKEW_RAD = 10.0, 0.1, 0.005
+#: sigmas, share of the squared residuals, and rad: of walls turned within scans by a sweep, and by
+#: the spacing of beams; of healthy logs up to 7, 0.03 and 0.004
+SWEEP, SPACING = (10.0, 0.1, 0.005), (10.0, 0.1, 0.005)
 #: ns without a scan, and usual times between two, in which a robot may be carried
 UNSEEN_NS, UNSEEN_SCANS = 1_000_000_000, 3
 #: ns without a scan in which a robot may stop and start again; m and rad that one which drives
@@ -39,7 +40,7 @@ def scan_doubts(evidence: Evidence) -> Iterator[Reason]:
             yield from _moved_unseen(robot, evidence)
             yield from _stood_unseen(robot, evidence)
             yield from _curved(robot)
-            yield from _skewed(robot)
+            yield from _distorted(robot)
 
 
 def _repeated(robot: RobotEvidence) -> Iterator[Reason]:
@@ -147,18 +148,34 @@ def _curved(robot: RobotEvidence) -> Iterator[Reason]:
         yield Reason("doubtful", "scans", robot.name, text)
 
 
-def _skewed(robot: RobotEvidence) -> Iterator[Reason]:
-    skew = robot.skew
-    if skew.sigmas > SKEW_SIGMAS and skew.share > SKEW_SHARE and skew.rms_rad > SKEW_RAD:
+def _distorted(robot: RobotEvidence) -> Iterator[Reason]:
+    """Of the two causes of walls that are turned within scans, that which explains more."""
+    sweep, spacing = robot.distortion
+    doubtful = "the map may be wrong by far more than is stated"
+    if _is_beyond(sweep, SWEEP) and sweep.share >= spacing.share:
         text = (
             f"{robot.name}: where it turns, the walls of a scan are turned against each other, as "
-            f"by beams that are measured one after the other in {abs(skew.sweep_s):.2f} s or more "
-            "and are taken as if otherwise: the map may be wrong by far more than is stated; set "
+            f"by beams that are measured one after the other in {abs(sweep.value):.2f} s or more "
+            f"and are taken as if otherwise: {doubtful}; set "
             "time_increment of the scans and leave logs.undistort on (or, if it is set though all "
             "beams are measured at once, --set logs.undistort=false); see docs/logs.md, Motion "
             "during a sweep"
         )
         yield Reason("doubtful", "scans", robot.name, text)
+    elif _is_beyond(spacing, SPACING):
+        which = "farther apart" if spacing.value > 0 else "closer together"
+        text = (
+            f"{robot.name}: the walls on one side of its scans are turned against those on the "
+            f"other, as by beams that are {100 * abs(spacing.value):.1f} % or more {which} than "
+            f"angle_increment says: {doubtful}; are angle_min, angle_max and angle_increment those "
+            "of this laser?"
+        )
+        yield Reason("doubtful", "scans", robot.name, text)
+
+
+def _is_beyond(found: Distortion, limits: tuple[float, float, float]) -> bool:
+    """Whether sigmas, share and rad are above limits."""
+    return all(np.array([found.sigmas, found.share, found.rms_rad]) > limits)
 
 
 def _by_odometry(robot: RobotEvidence, times_ns: IntTable) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 
 from graphslam.estimation.log_noise import MOTION
 from graphslam.logs.time_order import TOO_LATE
+from graphslam.verdict.corrected_scales import scale_facts
 from graphslam.verdict.doubts import Reason, seconds
 from graphslam.verdict.evidence import Evidence
 from graphslam.verdict.excursions import excursion_doubts
@@ -53,8 +54,9 @@ def judge(evidence: Evidence) -> dict[str, Any]:
 
     Gross errors that do no harm are facts, and no check sees them.
     """
-    rest, facts = without_harmless(evidence)
+    rest, errors = without_harmless(evidence)
     reasons = (reason for check in CHECKS.values() for reason in check(rest))
+    facts = (*errors, *scale_facts(evidence))
     return to_summary(reasons, [asdict(fact) for fact in facts])
 
 

@@ -15,7 +15,7 @@ from graphslam.pipeline.path_evidence import FACTORS, PathMisfits
 from graphslam.pipeline.scan_evidence import Parked, _half_changed
 from graphslam.verdict.evidence import ClosureMisfits, Evidence, RobotEvidence, Seen
 from graphslam.verdict.moved_points import moved_doubts
-from graphslam.verdict.sweep_skew import SweepSkew
+from graphslam.verdict.scan_distortion import Distortion, ScanDistortion
 from graphslam.verdict.verdict import judge, with_truth
 
 S = 1_000_000_000
@@ -195,6 +195,12 @@ def test_a_point_whose_range_is_not_measured_has_not_moved(range_sigma_m, doubts
     assert len(told) == doubts
 
 
+def distorted(sweep, spacing):
+    """Evidence of walls that are turned within scans."""
+    distortion = ScanDistortion(sweep, spacing)
+    return evidence(scans=True, seen=no_sightings, distortion=distortion)
+
+
 #: what is wrong, and what is said about it
 WRONG = {
     "a recording that was interrupted while the robot drove": (
@@ -206,8 +212,16 @@ WRONG = {
         "30 % of what it saw of walls is of curved ones",
     ),
     "a sweep that nobody told of": (
-        lambda: evidence(scans=True, seen=no_sightings, skew=SweepSkew(0.04, 30.0, 0.3, 0.013)),
+        lambda: distorted(Distortion(0.04, 30.0, 0.3, 0.013), Distortion(0.01, 20.0, 0.2, 0.01)),
         "one after the other in 0.04 s or more",
+    ),
+    "beams that are farther apart than is stated": (
+        lambda: distorted(Distortion(0.04, 20.0, 0.2, 0.01), Distortion(0.01, 30.0, 0.3, 0.013)),
+        "1.0 % or more farther apart than angle_increment says",
+    ),
+    "beams that are closer together than is stated": (
+        lambda: distorted(Distortion(), Distortion(-0.01, 30.0, 0.3, 0.013)),
+        "1.0 % or more closer together",
     ),
     "a named point that is moved": (
         lambda: evidence(seen=moved_point),

@@ -1,8 +1,10 @@
-"""Whether the walls of a scan are turned against each other as the robot turns.
+"""Whether the walls of a scan are turned against each other, and as by what.
 
 Beams that are measured one after the other while a robot turns, but are taken as if at once, show
 walls that are seen late in the sweep turned against those that are seen early: by the turning rate
-times the time in between. Nothing else does that: an error of the pose turns all of them alike.
+times the time in between. Beams that are farther apart than is stated turn them by the angle
+between them times the error of the spacing, whether the robot turns or not. Nothing else does
+either: an error of the pose turns all walls alike.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphslam.core.arrays import IntArray
-from graphslam.core.geometry import Array, wrap
+from graphslam.core.geometry import Array, inverse, transform, wrap
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, KeyframeScan
 from graphslam.odometry.preintegration import Track
@@ -26,29 +28,41 @@ LEAST_SIGMA = 0.01
 ENOUGH = 100
 
 
-class SweepSkew(NamedTuple):
-    """How walls are turned within scans: as if the beams of one were measured in ``sweep_s``.
+class Distortion(NamedTuple):
+    """How walls are turned within scans by one cause.
 
+    ``value`` is that of the cause; it comes out too small where the map is bent with the scans.
     ``sigmas``: how many of its sigmas that is; ``share`` of the squared residuals of directions
-    within scans that it explains; ``rms_rad``: how far it turns walls. A negative time is that of a
-    sweep against the order of the beams. Times come out too short where the map is bent with them.
+    within scans that it explains; ``rms_rad``: how far it turns walls.
     """
 
-    sweep_s: float = 0.0
+    value: float = 0.0
     sigmas: float = 0.0
     share: float = 0.0
     rms_rad: float = 0.0
 
 
-NO_SKEW = SweepSkew()
+class ScanDistortion(NamedTuple):
+    """How walls are turned within scans, by each of the causes alone.
+
+    The value of ``sweep`` is the time in s in which the beams of a scan are measured, negative
+    against their order; that of ``spacing`` by how much beams are farther apart than is stated,
+    relative to that.
+    """
+
+    sweep: Distortion = Distortion()
+    spacing: Distortion = Distortion()
 
 
-def sweep_skew(
+UNDISTORTED = ScanDistortion()
+
+
+def scan_distortion(
     seen: Sequence[Association],
     scans: Iterable[KeyframeScan],
     estimate: Estimate,
     track: Track,
-) -> SweepSkew:
+) -> ScanDistortion:
     """How the walls that one robot saw are turned within its scans.
 
     Args:
@@ -61,21 +75,24 @@ def sweep_skew(
     for a in seen:
         if a.model == "line" and a.extent is not None and a.target in estimate.landmarks:
             of.setdefault(a.time_ns, []).append(a)
-    clouds = {s.time_ns: s.points for s in scans if len(of.get(s.time_ns, ())) > 1}
+    clouds = {s.time_ns: s for s in scans if len(of.get(s.time_ns, ())) > 1}
     times = np.array(sorted(clouds), dtype=np.int64)
     if sum(len(of[time]) for time in clouds) < ENOUGH:
-        return NO_SKEW
+        return UNDISTORTED
     rates = _turning_rates(times, track)
     fastest = np.sort(np.argsort(-np.abs(rates), kind="stable")[:MOST_SCANS])
     times, rates = times[fastest], rates[fastest]
     own = [of[time] for time in times.tolist()]
-    parts = [_when(walls, clouds[time]) for walls, time in zip(own, times.tolist(), strict=True)]
+    found = [_where(walls, clouds[time]) for walls, time in zip(own, times.tolist(), strict=True)]
+    part, angle = np.concatenate(found, axis=1)
     walls = [a for some in own for a in some]
     which = np.repeat(np.arange(len(own)), [len(some) for some in own])
-    off = _direction_residuals(walls, estimate)
     weight = 1 / (np.array([a.cov[2, 2] for a in walls]) + LEAST_SIGMA**2)
-    turned = _within(rates[which] * np.concatenate(parts), which, weight)
-    return _fit(turned, _within(off, which, weight), weight)
+    off = _within(_direction_residuals(walls, estimate), which, weight)
+    sweep, spacing = (
+        _fit(_within(cause, which, weight), off, weight) for cause in (rates[which] * part, angle)
+    )
+    return ScanDistortion(sweep, spacing)
 
 
 def by_robot(scans: Iterable[KeyframeScan]) -> Mapping[str, list[KeyframeScan]]:
@@ -94,16 +111,19 @@ def _turning_rates(times_ns: IntArray, track: Track) -> Array:
     return np.asarray(turned / np.maximum(1e-9 * (end - begin), 1e-9))
 
 
-def _when(walls: Sequence[Association], points: Array) -> Array:
-    """When in a sweep the middles of its walls (k) are measured: (k,) from 0 to 1.
+def _where(walls: Sequence[Association], scan: KeyframeScan) -> Array:
+    """Where in a scan the middles of its walls (k) are: (2, k) parts from 0 to 1, and rad.
 
-    ``points`` (n, 2) are those of the sweep in its order.
+    Angles are those of beams in the frame of the laser, which go on beyond a whole turn.
     """
     z = np.array([a.z for a in walls])
     along = np.array([a.extent for a in walls]).mean(axis=1)
     middle = z[:, :2] + along[:, None] * np.column_stack([np.cos(z[:, 2]), np.sin(z[:, 2])])
-    apart = np.hypot(*(middle[:, None] - points[None]).transpose(2, 0, 1))
-    return np.asarray(apart.argmin(axis=1) / len(points))
+    apart = np.hypot(*(middle[:, None] - scan.points[None]).transpose(2, 0, 1))
+    nearest = apart.argmin(axis=1)
+    local = transform(inverse(scan.sensor), scan.points)
+    angles = np.unwrap(np.arctan2(local[:, 1], local[:, 0]))
+    return np.stack([nearest / len(scan.points), angles[nearest]])
 
 
 def _direction_residuals(walls: Sequence[Association], estimate: Estimate) -> Array:
@@ -121,14 +141,14 @@ def _within(values: Array, which: IntArray, weight: Array) -> Array:
     return np.asarray(values - mean[which])
 
 
-def _fit(turned: Array, off: Array, weight: Array) -> SweepSkew:
-    """The time, s, by which ``turned`` (n,) rad/s has to be multiplied to be ``off`` (n,) rad."""
+def _fit(turned: Array, off: Array, weight: Array) -> Distortion:
+    """The value by which ``turned`` (n,) has to be multiplied to be ``off`` (n,) rad."""
     information = float(weight @ turned**2)
     before = float(weight @ off**2)
     if not information * before > 0:
-        return NO_SKEW
-    sweep_s = float(weight @ (turned * off)) / information
-    after = float(weight @ (off - sweep_s * turned) ** 2)
-    sigma_s = np.sqrt(max(after, 1e-12 * before) / len(off) / information)
-    rms_rad = abs(sweep_s) * float(np.sqrt(np.mean(turned**2)))
-    return SweepSkew(sweep_s, abs(sweep_s) / float(sigma_s), 1 - after / before, rms_rad)
+        return Distortion()
+    value = float(weight @ (turned * off)) / information
+    after = float(weight @ (off - value * turned) ** 2)
+    sigma = np.sqrt(max(after, 1e-12 * before) / len(off) / information)
+    rms_rad = abs(value) * float(np.sqrt(np.mean(turned**2)))
+    return Distortion(value, abs(value) / float(sigma), 1 - after / before, rms_rad)
