@@ -74,9 +74,9 @@ def _used(robot: str, turning: Turning) -> Finding:
 
 
 def _not_used(robot: str, topic: str, why: str) -> Finding:
-    text = f"the gyroscope of {topic} is not used: {why}"
+    text = f"the gyroscope of {robot} is not used: {why}"
     remedy = "check its axes in /tf_static and its units"
-    return Finding("note", "gyroscope", f"robot {robot}", text, remedy)
+    return Finding("note", "gyroscope", topic, text, remedy)
 
 
 def _poses(

@@ -26,6 +26,8 @@ from graphslam.logs.topic_info import RobotInfo, TopicInfo
 _UNSIGNED_PATH_M = 50.0
 #: a robot that moved less, m and rad, tells neither its calibration nor a map
 _STANDING_M, _STANDING_RAD = 0.1, 0.1
+#: m/s that no robot drives in the mean: odometry in other units
+_FASTEST_M_S = 30.0
 #: s between messages, beyond which the motion in between is guessed; between scans, see too little
 _SLOW_ODOMETRY_S, _SLOW_SCANS_S = 0.5, 1.5
 #: share of the beams without a range, above which a laser sees next to nothing
@@ -228,6 +230,9 @@ def _motion(log: CheckedLog) -> Iterable[Finding]:
         where = f"robot {robot.name}"
         if robot.problem:
             yield Finding("doubt", "odometry", where, robot.problem)
+        elif (robot.speed_m_s or 0) > _FASTEST_M_S:
+            text = f"odometry says {robot.speed_m_s:.0f} m/s in the mean; is it in metres?"
+            yield Finding("doubt", "odometry", where, text, "check the units of what publishes it")
         elif robot.reverses is False and (robot.path_m or 0) > _UNSIGNED_PATH_M:
             text = f"odometry never reverses in {robot.path_m:.0f} m; it may be unsigned"
             yield Finding("doubt", "odometry", where, text, "check its sign while driving back")

@@ -143,7 +143,8 @@ def inspect_logs(paths: Sequence[Path], config: Config) -> LogInfo:
         infos = [replace(info, used=info.used or info.name in names) for info in infos]
     said = [*config.warnings, *(finding.line for finding in findings)]
     known = CheckedLog(infos, robots, problem, config, merged_notes(files), len(files))
-    more = check_log(known)
+    told = {finding.topic for finding in findings if finding.check == "gyroscope"}
+    more = [f for f in check_log(known) if f.check != "unused" or f.topic not in told]
     said += [finding.line for finding in more if finding.severity == "doubt"]
     return LogInfo(
         files=tuple(LogFile(f.path, f.sha256, f.messages, f.lost) for f in files),

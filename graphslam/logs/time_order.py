@@ -26,6 +26,8 @@ DROPPED = (TOO_LATE, REPEATED, REPEATED_SIGHTING)
 
 #: s of lateness up to which a longer window is advised: it has so much of a log in memory
 LONGEST_WINDOW_S = 30.0
+#: s of lateness from which on a clock that was set back is as likely as a transport that was slow
+LONGEST_DELAY_S = 2.0
 
 # A stamp is compared with at most this many later ones of its topic within the window: an absurd
 # one far in the future would otherwise never leave the window.
@@ -57,7 +59,10 @@ def late_remedy(late_s: float) -> str:
     """What mends that messages come up to ``late_s`` late by their stamps."""
     if late_s > LONGEST_WINDOW_S:
         return "let all topics be stamped by one clock that is not set back"
-    return f"--set logs.reorder_s={math.ceil(late_s + 0.1)} keeps them"
+    keeps = f"--set logs.reorder_s={math.ceil(late_s + 0.1)} keeps them"
+    if late_s > LONGEST_DELAY_S:
+        keeps += "; if a clock was set back, cut the recording there instead"
+    return keeps
 
 
 def late_text(late_s: float) -> str:

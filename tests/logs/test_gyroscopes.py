@@ -11,7 +11,7 @@ from graphslam.core.config_io import load_config
 from graphslam.core.geometry import between, compose, exp, wrap
 from graphslam.core.geometry import log as log_of
 from graphslam.core.motion_models import rows_of_twists, wheel_twist
-from graphslam.logs import LogWriter, open_logs, schemas
+from graphslam.logs import LogWriter, inspect_logs, open_logs, schemas
 from graphslam.logs.cdr_writing import imu_bytes, tf_bytes
 from graphslam.logs.imu_turning import GAP_NS, Turning, find_turning
 
@@ -163,7 +163,10 @@ def test_the_first_usable_one_of_several_is_used(tmp_path):
             log.encoded("/imu/data", schemas.IMU, imu_bytes(time, "imu", rate), time)
     log = open_logs([path], Config())
     assert log.gyroscopes["robot"].topic == "/imu/data"
-    assert any("/a/accel is not used: it has no readings" in line for line in log.warnings)
+    assert any(
+        line.startswith("/a/accel: the gyroscope of robot is not used: it has no readings")
+        for line in log.warnings
+    )
 
 
 def test_a_log_without_a_usable_gyroscope_is_read_to_the_bit_as_without_any(tmp_path):
@@ -172,6 +175,8 @@ def test_a_log_without_a_usable_gyroscope_is_read_to_the_bit_as_without_any(tmp_
     path = write(tmp_path / "log.mcap", times, poses, at, -rates)
     log = open_logs([path], Config())
     assert not log.gyroscopes and any("is not used: it turns -" in line for line in log.warnings)
+    checks = {finding.check for finding in inspect_logs([path], Config()).findings}
+    assert "gyroscope" in checks and "unused" not in checks  # such messages are read
     bare = open_logs([write(tmp_path / "bare.mcap", times, poses, at[:0], rates[:0])], Config())
     for a, b in zip(log.messages(), bare.messages(), strict=True):
         assert a.time_ns == b.time_ns

@@ -98,6 +98,7 @@ CASES = {
     "slow odometry": ({"odometry_period_ns": S}, "doubt", "rate", "every 1.0 s only"),
     "slow scans": ({"scan_period_ns": 3 * S}, "doubt", "rate", "every 3.0 s only"),
     "standing": ({"speed": 0.0}, "doubt", "odometry", "does not move"),
+    "millimetres": ({"speed": 500.0}, "doubt", "odometry", "500 m/s in the mean; is it in metres"),
     "blind": ({"ranges": 99.0}, "doubt", "ranges", "100 % of the beams"),
     "late clock": (
         {"scan_offset_ns": -2 * S, "scan_recorded_late_ns": 2 * S}, "doubt", "clocks",

@@ -253,6 +253,7 @@ def test_a_message_older_than_the_window_is_dropped_and_counted(tmp_path):
     assert len(messages) == 100 and sum(logs.dropped.values()) == 1
     (setting,) = re.findall("--set (logs.reorder_s=[0-9]+) keeps them", logs.warnings[-1])
     assert len(list(open_logs([path], load_config(None, [setting])).messages())) == 101
+    assert "if a clock was set back, cut the recording there" in logs.warnings[-1]
     logs, messages = read(path, Config(logs=LogsConfig(reorder_s=20.0)))
     assert len(messages) == 101 and not logs.dropped
 
