@@ -42,6 +42,14 @@ SCENARIOS = (
     "lab", "corridor", "two-robots", "robots-in-scans", "office-loop", "two-lasers",
     "long-corridor", "forest", "fleet",
 )  # fmt: skip
+#: settings without which a scenario shows nothing of a robot, see docs/several-robots.md
+SETTINGS = {
+    "robots-in-scans": (
+        "robots.pioneer.outline=[[-0.22, -0.19], [0.23, -0.19], [0.23, 0.19], [-0.22, 0.19]]",
+        "start.poses.pioneer=[1.5, 0, 0]",
+        "start.poses.vehicle=[0, 0, 0]",
+    )
+}
 MOST_DOUBTFUL = 0.01
 Make = Callable[[Path], None]
 #: part of a log -> first and last time, ns, by those of the whole
@@ -116,7 +124,7 @@ def write_part(source: Path, make: Make, part: str, path: Path) -> None:
 
 def row_of(kind: str, name: str, path: Path) -> dict[str, Any]:
     """The verdicts on a log."""
-    began, config = time.process_time(), load_config()
+    began, config = time.process_time(), load_config(overrides=SETTINGS.get(kind, ()))
     result = smooth(open_logs([path], config), config)
     alone = result.summary["verdict"]
     row = {"kind": kind, "log": name, "verdict": alone["verdict"], "reasons": alone["reasons"]}
