@@ -31,6 +31,10 @@ TOP_SPEED_M_S, TOP_TURN_RAD_S = 30.0, 12.0
 CREEP_M_S, CREEPING, STRAIGHT_RAD_S, STRAIGHT = 0.01, 0.5, 0.02, 0.2
 #: m, rad: a motion within one period that is more than the robot can do by so much is a jump
 JUMP_M, JUMP_RAD = 0.22, 0.4
+#: m, m/s²: a deviation from the speed around it by more is no motion of wheels: 2 cm within 20 ms
+#: and 10 cm within 100 ms; share of motions that may be so: else it is how the odometry counts;
+#: share of motions that take about as long as usual, without which nothing is told
+SUDDEN_M, SUDDEN_M_S2, SUDDEN, EVEN = 0.02, 10.0, 0.02, 0.9
 #: s: odometry without a reading for longer is a guess; periods of the topic
 GAP_S, GAP_PERIODS = 3.0, 8.0
 #: share of the time, or of increments, that may be missing, or overlap
@@ -66,7 +70,8 @@ def odometry_doubts(evidence: Evidence) -> Iterator[Reason]:
     for robot in evidence.robots:
         if robot.name in evidence.without_odometry or len(robot.readings_ns) < 3:
             continue
-        found = list(chain(_gaps(robot), _speed(robot), _jumps(robot), _frozen(robot)))
+        jumps = list(_jumps(robot)) or _corrections(robot)
+        found = list(chain(_gaps(robot), _speed(robot), jumps, _frozen(robot)))
         yield from found
         if not found:
             found = [*_factors(robot), *_opposite(robot), *_along_walls(robot)]
@@ -225,6 +230,32 @@ def _jumps(robot: RobotEvidence) -> Iterator[Reason]:
             f"{seconds(robot.readings_ns[k + 1], origin)}"
         )
         yield _reason(robot, "doubtful", text + (f", and {len(at) - 1} times more" * (len(at) > 1)))
+
+
+def _corrections(robot: RobotEvidence) -> Iterator[Reason]:
+    """Motions too sudden for wheels, again and again: a localisation corrects the odometry.
+
+    They deviate from the speed both before and after. Where stamps are uneven, or motions come in
+    bursts, nothing is told.
+    """
+    moved, apart = _steps(robot)
+    usual = float(np.median(apart))
+    if robot.source == "given" or len(apart) < LEAST_POSES or not usual > 0:
+        return
+    even = (apart > usual / 2) & (apart < 2 * usual)
+    told = even[:-2] & even[1:-1] & even[2:]
+    speed = moved[:, :2] / np.maximum(apart, usual / 2)[:, None]
+    off = np.stack([speed[1:-1] - speed[:-2], speed[1:-1] - speed[2:]]) * apart[1:-1, None]
+    size = np.hypot(off[..., 0], off[..., 1]).min(axis=0)
+    is_sudden = told & (size > np.maximum(SUDDEN_M, SUDDEN_M_S2 * apart[1:-1] ** 2))
+    if even.mean() < EVEN or is_sudden.mean() > SUDDEN or size[is_sudden].sum() < JUMP_M:
+        return
+    number = np.count_nonzero(is_sudden)
+    text = (
+        f"jumps {number} times within one period, by {np.median(size[is_sudden]):.2f} m in the "
+        "median: if a localisation corrects it, record the wheels' own odometry"
+    )
+    yield _reason(robot, "doubtful", text)
 
 
 def _frozen(robot: RobotEvidence) -> Iterator[Reason]:

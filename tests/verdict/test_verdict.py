@@ -117,6 +117,14 @@ def jumped(*jump, faster=1):
     return steps
 
 
+def corrected(times):
+    """Motions with so many corrections of the position, each by 0.12 m to the side."""
+    steps = drive()
+    for k in range(50, 50 + 50 * times, 50):
+        steps[k] = compose(steps[k], np.array([0, 0.12, 0]))
+    return steps
+
+
 def from_half(change):
     """Sightings with (bearing, range) changed from the middle of the log on."""
 
@@ -127,6 +135,23 @@ def from_half(change):
         return replace(own, z=z)
 
     return seen
+
+
+def in_steps_of(period):
+    """Motions as of encoders that are read at every so many readings of odometry."""
+    whole = drive()
+    steps = np.zeros_like(whole)
+    for k in range(0, len(whole) - period, period):
+        steps[k + period - 1] = whole[k : k + period].sum(axis=0)
+    return steps
+
+
+@pytest.mark.parametrize(
+    "steps", [corrected(1), in_steps_of(3)], ids=["one bump", "encoders that are read less often"]
+)
+def test_sudden_motions_that_are_rare_or_the_rule_are_no_corrections(steps):
+    """0.12 m once is a bump; 0.18 m in every third period is how that odometry counts."""
+    assert "jumps" not in reasons(evidence(steps))[1]
 
 
 @pytest.mark.parametrize("scans", [False, True])
@@ -247,6 +272,10 @@ WRONG = {
     "jump of a fast robot": (lambda: evidence(jumped(0.3, 0, 0, faster=5)), "jumps by 0.6"),
     "jump": (lambda: evidence(jumped(0.3, 0, 0)), "jumps by 0.36 m"),
     "turn": (lambda: evidence(jumped(0, 0, 2.0)), "jumps by 0.06 m and 2.0"),
+    "odometry that a localisation corrects": (
+        lambda: evidence(corrected(10)),
+        "jumps 10 times within one period, by 0.12 m",
+    ),
     "resets": (lambda: evidence(resets=2), "jumped 2 times"),
     "carried while the laser pauses, to where nothing is as before": (
         lambda: paused(lost_ns=np.array([[199 * S, 241 * S]]) // 10),
