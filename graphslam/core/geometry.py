@@ -211,6 +211,14 @@ def adjoint(pose: Array) -> Array:
     return out
 
 
+def moved_by_world(poses: Array) -> Array:
+    """Derivative (..., 3, 3) of poses by the twist of their world."""
+    J = np.zeros((*poses.shape, 3))
+    J[..., range(3), range(3)] = 1.0
+    J[..., 0, 2], J[..., 1, 2] = -poses[..., 1], poses[..., 0]
+    return J
+
+
 def compose_jacobians(a: Array, b: Array) -> tuple[Array, Array]:
     """Derivatives ``(..., 3, 3)`` of ``compose(a, b)`` by a and b, additive errors.
 

@@ -5,8 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphslam.core.geometry import Array, between, log
+from graphslam.core.geometry import Array, adjoint, between, inverse, log, moved_by_world
 from graphslam.core.record import Record
+
+#: m and rad: sigma of what nothing is known of
+UNKNOWN = 1e3
+#: landmarks that hold a map, at most: it takes time by the cube of their number
+MOST_HOLDING = 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +66,62 @@ class KnownLandmarks(Record):
             information[np.ix_(own, own)] += row.T @ row
         wanted = rows(landmarks)
         return np.asarray(np.linalg.inv(information)[np.ix_(wanted, wanted)])
+
+    def rows_at(self, values: Mapping[int, Array]) -> list[tuple[tuple[int, ...], Array]]:
+        """`rows` in the tangent spaces of other values of the landmarks than their means.
+
+        The rows say nothing more of the pose of the whole map there than at the means. The errors
+        of the values themselves are the same: Ad(exp(v)) v = v.
+        """
+        carried = {
+            n: np.eye(2) if len(mean) == 2 else adjoint(between(mean, values[n]))
+            for n, mean in self.means.items()
+        }
+        made = []
+        for numbers, row in self.rows():
+            ends = np.cumsum([len(carried[n]) for n in numbers])
+            blocks = np.split(row, ends[:-1], axis=1)
+            parts = [block @ carried[n] for n, block in zip(numbers, blocks, strict=True)]
+            made.append((numbers, np.concatenate(parts, axis=1)))
+        return made
+
+    def pose_covariance(self) -> Array:
+        """Covariance (3, 3), m and rad, of the twist by which all landmarks are moved alike.
+
+        That is how well it is known where in the world the map lies. What is not known at all, such
+        as the place along a single wall, has sigmas of `UNKNOWN`.
+        """
+        moved = self._moved_by_world()
+        information = np.eye(3) / UNKNOWN**2
+        for numbers, row in self.rows():
+            J = row @ np.concatenate([moved[n] for n in numbers])
+            information += J.T @ J
+        return np.asarray(np.linalg.inv(information))
+
+    def pose_rows(self) -> tuple[tuple[int, ...], Array]:
+        """Numbers of up to `MOST_HOLDING` landmarks, and rows (3, D) that their errors have.
+
+        These are those of the twist by which they are moved alike, by least squares with the
+        information on each by itself, in sigmas of `pose_covariance`.
+        """
+        moved, own = self._moved_by_world(), {n: np.zeros((0, 0)) for n in self.numbers}
+        for (number, *_), row in self.rows():
+            own[number] = row[:, : len(row)].T @ row[:, : len(row)]
+        some = tuple(self.numbers[:: 1 + (len(self.numbers) - 1) // MOST_HOLDING])
+        weighed = np.concatenate([moved[n].T @ own[n] for n in some], axis=1)
+        information = weighed @ np.concatenate([moved[n] for n in some])
+        twist = np.linalg.solve(information + np.eye(3) / UNKNOWN**2, weighed)
+        white = np.linalg.inv(np.linalg.cholesky(self.pose_covariance()))
+        return some, np.asarray(white @ twist)
+
+    def _moved_by_world(self) -> dict[int, Array]:
+        """Derivative (d, 3) of each landmark's error by the twist of the world."""
+        return {
+            n: moved_by_world(np.append(mean, 0.0))[:2]
+            if len(mean) == 2
+            else adjoint(inverse(mean))
+            for n, mean in self.means.items()
+        }
 
     def given_the_others(
         self, landmarks: Mapping[int, tuple[Array, Array]]

@@ -46,10 +46,7 @@ class OdometryPose(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryIncrement(Message):
-    """Pose of the base at ``time_ns`` in the base frame at ``start_ns``.
-
-    ``cov`` (3, 3) is along the axes of the base frame at ``start_ns``.
-    """
+    """Pose of the base at ``time_ns`` in that at ``start_ns``; ``cov`` (3, 3) along its axes."""
 
     start_ns: int
     delta: Array
@@ -248,11 +245,13 @@ class Start(Record):
     """Prior of a robot's first state: pose (3,), cov (3, 3) along world axes.
 
     ``base_cov``: ``cov`` without the sensor's mount, where the start of the base was told.
+    ``world_cov``: that by which covariances are, where ``cov`` is relative to a map.
     """
 
     pose: Array
     cov: Array
     base_cov: Array | None = None
+    world_cov: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

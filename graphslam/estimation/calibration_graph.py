@@ -227,6 +227,7 @@ class CalibrationGraph:
         half_error = self._error
         if marginals:
             self._relinearise()
+            builder.place(in_world=True)
             half_error = float(builder.graph.error(values))
             if bias_m is not None and builder.observes_walls:
                 self.line_noise = fit_line_noise(self.line_residuals())
@@ -235,6 +236,7 @@ class CalibrationGraph:
                 found = marginals_of(builder.graph, values, keep_rows=joint)
             except RuntimeError as error:
                 raise builder.explain(error) from error
+            builder.place(in_world=False)
         self._rows, covs = found.rows, found.marginals
         means = with_means(values, builder.dims(), covs)
         mounted = self._mount_places() if mounts else {}
@@ -258,12 +260,14 @@ class CalibrationGraph:
         return calibrations
 
     def _relinearise(self) -> None:
-        """Put motions in the graph as they are linear around the last solution, for covariances.
+        """Put factors in the graph as they are linear around the last solution, for covariances.
 
-        They were around that from which it was sought, in the axes of its poses. Where these have
-        turned since, the motions change if all is turned alike, which would be information about
-        the direction of the whole map that no measurement has.
+        These are what is known of landmarks, and the motions. They were around that from which it
+        was sought, in the axes of its poses. Where these have turned since, they change if all is
+        turned alike, which would be information about the direction of the whole map that no
+        measurement has.
         """
+        self._builder.carry_known(self._values)
         if self._linear_at is self._values:
             return
         found = self._calibrations({})

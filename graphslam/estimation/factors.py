@@ -403,7 +403,10 @@ def linearised(
 def known_landmark_factor(
     numbers: Sequence[int], row: Array, means: Mapping[int, Array]
 ) -> gtsam.NonlinearFactor:
-    """Whitened rows of the errors of known landmarks about their means, see `KnownLandmarks`."""
+    """Whitened rows of the errors of known landmarks about their means, see `KnownLandmarks`.
+
+    A `gtsam.LinearContainerFactor` has these rows wherever it is linearised.
+    """
     keys = [landmark_key(number) for number in numbers]
     values, terms, end = gtsam.Values(), [], 0
     for key, number in zip(keys, numbers, strict=True):

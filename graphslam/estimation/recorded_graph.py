@@ -15,8 +15,9 @@ import numpy as np
 from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, are_positive
+from graphslam.core.known_landmarks import UNKNOWN, KnownLandmarks
 from graphslam.core.observation_models import MODELS
-from graphslam.core.records import Association, Estimate, Motion, Step
+from graphslam.core.records import Association, Estimate, Motion, Start, Step
 from graphslam.estimation import factors
 from graphslam.estimation.factor_graph import covariance_of
 from graphslam.estimation.input_checks import describe, describe_motion
@@ -29,6 +30,8 @@ Source = tuple[str, str]
 #: ns: within this time the errors of one target's sightings may be the same. Ranges by the apparent
 #: height of a barcode correlate by 0.9 from image to image and by half after 8 s.
 SHARED_NS = 10_000_000_000
+#: sigmas of the pose of a known map by which solutions may move it
+HELD = 0.1
 #: a shared error that a source does not have is still a variable: its variance, of the white one's
 NO_SHARED_ERROR = 1e-4
 
@@ -84,6 +87,10 @@ class RecordedGraph(BatchGraph):
         self.polar: dict[Source, tuple[Array, Array]] = {}
         self.shared_errors: dict[Source, SharedErrors] = {}
         self._stand_ins = 0
+        # with the index of their (first) factor
+        self._known_at: list[tuple[int, KnownLandmarks]] = []
+        self._relative_starts: list[tuple[int, Start]] = []
+        self._held: list[tuple[int, Sequence[int], Array, KnownLandmarks]] = []
 
     def insert_all(
         self,
@@ -105,7 +112,10 @@ class RecordedGraph(BatchGraph):
         poses = {robot: path.poses.tolist() for robot, path in start.states.items()}
         for step in steps:
             if step.starts or step.known is not None:
+                self._note_priors(step)
                 self.insert(Step(step.time_ns, step.starts, known=step.known), start, values)
+                if step.known is not None and step.known.numbers:
+                    self._hold(step.known)
             for robot, motion in step.motions.items():
                 last = self.latest_key(robot, step.time_ns)
                 number = self.states.append(robot, step.time_ns)
@@ -128,6 +138,53 @@ class RecordedGraph(BatchGraph):
         self._make_motions(motions, without_motions)
         for source, observed in sorted(polar.items(), key=lambda one: (one[0][1], one[0][0])):
             self._insert_polar(source, observed, start, values)
+
+    def _note_priors(self, step: Step) -> None:
+        """Note where in the graph the priors of a step will be that are not always the same."""
+        index = self.graph.size()
+        if step.known is not None:
+            self._known_at.append((index, step.known))
+            index += len(step.known.numbers)
+        starts = enumerate(step.starts.values(), index)
+        self._relative_starts += [(k, one) for k, one in starts if one.world_cov is not None]
+
+    def _hold(self, known: KnownLandmarks) -> None:
+        """Let a known map stay where it is in solutions, see `place`."""
+        self._held.append((self.graph.size(), *known.pose_rows(), known))
+        self.graph.resize(self.graph.size() + 1)
+        self.place(in_world=False)
+
+    def place(self, *, in_world: bool) -> None:
+        """Let a known map, and what is relative to a map, be as uncertain as in the world, or not.
+
+        A log tells nothing of where its map is in the world. In solutions nothing must move it
+        there, where that is hardly known: neither a start that the map told nor how its landmarks
+        are linear. So the map is held, by `HELD` of its sigmas, and starts are as they are in the
+        map. Covariances have neither: they would tell what nobody measured.
+        """
+        for index, numbers, rows, known in self._held:
+            scale = 1.0 / UNKNOWN if in_world else 1.0 / HELD
+            factor = factors.known_landmark_factor(numbers, scale * rows, known.means)
+            self.graph.replace(index, factor)
+        for index, start in self._relative_starts:
+            (key,) = self.graph.at(index).keys()
+            cov = start.world_cov if in_world and start.world_cov is not None else start.cov
+            self.graph.replace(index, factors.start_factor(key, Start(start.pose, cov)))
+
+    def carry_known(self, values: gtsam.Values) -> None:
+        """Put what is known of landmarks in the graph in the axes of their ``values``.
+
+        By their means it would be information about the direction of the map that nothing has,
+        where walls were turned, or moved along themselves, since.
+        """
+        for first, known in self._known_at:
+            at = {
+                n: factors.read(values, factors.landmark_key(n), len(mean))
+                for n, mean in known.means.items()
+            }
+            for k, (numbers, row) in enumerate(known.rows_at(at)):
+                factor = factors.known_landmark_factor(numbers, row, known.means)
+                self.graph.replace(first + k, factor)
 
     def _reserve_motion(self, robot: str, last: int) -> None:
         """Take a place in the graph for the motion from a robot's state of this key to the next."""

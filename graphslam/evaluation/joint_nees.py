@@ -10,10 +10,18 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphslam.core.arrays import IntArray
-from graphslam.core.geometry import Array, adjoint, between, compose, inverse, rotation3
+from graphslam.core.geometry import (
+    Array,
+    adjoint,
+    between,
+    compose,
+    inverse,
+    moved_by_world,
+    rotation3,
+)
 from graphslam.core.records import JointScans, RobotResult
 from graphslam.estimation.joint_covariances import covariance_of, joint_covariance
-from graphslam.odometry.mount_covariance import moved_by_mount, moved_by_world
+from graphslam.odometry.mount_covariance import moved_by_mount
 from graphslam.results.folder import SavedRobot
 
 Robots = Mapping[str, RobotResult] | Mapping[str, SavedRobot]

@@ -6,7 +6,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from types import MappingProxyType
 from typing import Any
@@ -34,9 +34,10 @@ SIGHTING_MS = 0.15
 class FrameAssignment:
     """Start pose of every robot, and its frame, named after the robot that begins at its origin.
 
-    ``world`` is the frame of the world. ``found``: robot -> the relation by which it was placed.
-    ``undecided``: robot -> why it has a separate frame although it shares observations with
-    others. ``remarks``: robot -> what is to be known about where it was placed.
+    ``world`` is the frame of the world. ``found``: robot -> the relation by which it was placed,
+    with the covariance of all that it hangs on. ``undecided``: robot -> why it has a separate frame
+    although it shares observations with others. ``remarks``: robot -> what is to be known about
+    where it was placed.
     """
 
     starts: Mapping[str, Start]
@@ -63,7 +64,7 @@ class FrameAssignment:
         summary = {}
         for robot, relation in sorted(self.found.items()):
             x, y, phi = self.starts[robot].pose.tolist()
-            sigmas = np.sqrt(np.diag(self.starts[robot].cov)) / PRIOR_INFLATION
+            sigmas = np.sqrt(np.diag(relation.cov))
             summary[robot] = {
                 "x": x,
                 "y": y,
@@ -166,6 +167,7 @@ def build_frame_tree(
         for name, relation in found.items()
         if _is_turned_anyhow(relation, known)
     }
+    found = {name: replace(relation, cov=placed[name].cov) for name, relation in found.items()}
     return FrameAssignment(priors, frames, world, found, alone, remarks)
 
 

@@ -289,9 +289,12 @@ class FrameTransforms:
         starts = {}
         for robot, start in step.starts.items():
             world = self.robots[robot]
-            base = None if start.base_cov is None else rotate_cov(start.base_cov, world[2])
-            cov = rotate_cov(start.cov, world[2])
-            starts[robot] = Start(compose(world, start.pose), cov, base)
+            cov, *others = (
+                None if cov is None else rotate_cov(cov, world[2])
+                for cov in (start.cov, start.base_cov, start.world_cov)
+            )
+            assert cov is not None
+            starts[robot] = Start(compose(world, start.pose), cov, *others)
         return replace(step, starts=starts)
 
 

@@ -12,7 +12,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphslam.core.arrays import IntArray
-from graphslam.core.geometry import Array, between, compose, compose_jacobians, inverse
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    compose_jacobians,
+    inverse,
+    moved_by_world,
+)
 from graphslam.core.mount_covariances import MountCovariance, MountCovariances
 from graphslam.core.record import replace
 from graphslam.core.records import Estimate, Trajectory
@@ -100,14 +107,6 @@ def moved_by_mount(sensor: Array, mount: Array) -> Array:
     x, y = mount[:2]
     of_inverse = np.array([[-c, -s, s * x - c * y], [s, -c, c * x + s * y], [0.0, 0.0, -1.0]])
     return np.asarray(G @ of_inverse)
-
-
-def moved_by_world(poses: Array) -> Array:
-    """Derivative (..., 3, 3) of poses by the twist of their world."""
-    J = np.zeros((*poses.shape, 3))
-    J[..., range(3), range(3)] = 1.0
-    J[..., 0, 2], J[..., 1, 2] = -poses[..., 1], poses[..., 0]
-    return J
 
 
 def _twist_of_world(start: Array, mount: Array) -> Array:

@@ -19,7 +19,7 @@ import numpy as np
 
 from graphslam.core.config import Config, ScanMatchingConfig
 from graphslam.core.errors import ConfigError, OutputError
-from graphslam.core.geometry import Array, rotation3
+from graphslam.core.geometry import Array, moved_by_world, rotation3
 from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
 from graphslam.core.record import replace
 from graphslam.core.records import JointScans, KeyframeScan, Landmark, Result, Trajectory
@@ -32,7 +32,6 @@ from graphslam.mapping.map_update import (
     without_days_biases,
 )
 from graphslam.mapping.submaps import SubmapPose, build_submaps
-from graphslam.odometry.mount_covariance import moved_by_world
 from graphslam.results.file_formats import landmark_from_json, landmark_json
 from graphslam.results.folder import SavedResult, check_one_frame, load
 from graphslam.results.joint_file import UNREADABLE, joint_scans

@@ -14,7 +14,15 @@ from graphslam.core.consistency import distances_from_others
 from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared, symmetric
-from graphslam.core.geometry import Array, between, compose, compose_cov, inverse, wrap
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    compose_cov,
+    inverse,
+    moved_by_world,
+    wrap,
+)
 from graphslam.core.record import replace
 from graphslam.core.records import Start
 from graphslam.core.suggestions import start_option
@@ -100,7 +108,9 @@ def start_as_given(
     if not placed.confirmed.any():
         said = "no place of it is recognised; the log is where its start was told to be"
     scan_log.map_doubt = said
-    return (start_of_closed_path(laid, robot) if placed.confirmed.any() else given), laid
+    if not placed.confirmed.any():
+        return given, laid
+    return in_world(start_of_closed_path(laid, robot), known_map.known.pose_covariance()), laid
 
 
 def is_contradicted(given: Start, pose: Array, cov: Array, *, is_used: bool) -> bool:
@@ -170,7 +180,8 @@ def found_start(
         best, refusal = best_explanation(supports, own.places, scan_log.config.multi_robot, seen_m)
         if refusal is None:
             scan_log.map_doubt = doubt(supports[best], own.places, scan_log.config.loop_closure)
-            return found[best]
+            start, laid = found[best]
+            return in_world(start, known_map.known.pose_covariance()), laid
         why = refusal.text
     raise EstimationError(
         f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; give "
@@ -227,6 +238,17 @@ def start_of_closed_path(laid: ClosedPaths, robot: str) -> Start:
     told_apart = np.diag(np.array([DISTINCT_M, DISTINCT_M, DISTINCT_RAD]) ** -2.0)
     cov = PRIOR_INFLATION**2 * laid.start_covariance(robot)
     return Start(pose, symmetric(np.asarray(np.linalg.inv(np.linalg.inv(cov) + told_apart))))
+
+
+def in_world(start: Start, map_cov: Array) -> Start:
+    """A start that is known relative to a map, with its covariance in the world.
+
+    Where the map lies in the world is known to ``map_cov`` (3, 3), of the twist that moves it. The
+    start must not tell that again, each day or session anew: `PRIOR_INFLATION` times as uncertain,
+    it tells next to nothing of it.
+    """
+    J = PRIOR_INFLATION * moved_by_world(start.pose)
+    return replace(start, world_cov=symmetric(start.cov + J @ map_cov @ J.T))
 
 
 def place_path(scan_log: ScanLog, robot: str, start: Start) -> None:

@@ -11,7 +11,7 @@ what was refused with less in common is tried again (`next_pair`). A group that 
 end has a frame of its own.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -20,7 +20,14 @@ import numpy as np
 from graphslam.core.config import Config
 from graphslam.core.errors import EstimationError
 from graphslam.core.frame_forest import PRIOR_INFLATION
-from graphslam.core.geometry import Array, between, compose, compose_cov, inverse
+from graphslam.core.geometry import (
+    Array,
+    between,
+    compose,
+    compose_cov,
+    inverse,
+    moved_by_world,
+)
 from graphslam.core.known_landmarks import KnownLandmarks, SparseRoot
 from graphslam.core.records import Start
 from graphslam.logs import LogSet
@@ -41,6 +48,7 @@ from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.pipeline.start_priors import origin, start_poses
 from graphslam.scan_smoothing.localisation import (
     close_path_in_map,
+    in_world,
     own_places,
     possible_starts,
     start_of_closed_path,
@@ -81,16 +89,29 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
     remarks = dict(doubted)
     for group in groups:
         leader = world if group is groups[0] else next(iter(group.starts))
-        starts |= group.starts
+        starts |= _as_priors(group.starts, given)
         frames |= dict.fromkeys(group.starts, leader)
         remarks |= group.remarks
         for name in group.starts.keys() - {leader, *given}:
-            start = starts[name]
+            start = group.starts[name]
             cov = start.cov / PRIOR_INFLATION**2
             pose = between(starts[leader].pose, start.pose)
             found[name] = RelativeFrame(name, leader, pose, cov, group.confirmed[name])
     undecided = {name: why for name, why in refused.items() if frames[name] == name != world}
     return FrameAssignment(starts, frames, world, found, undecided, remarks)
+
+
+def _as_priors(starts: Mapping[str, Start], given: Collection[str]) -> dict[str, Start]:
+    """Starts in a group, as priors in the world; those that were ``given`` are already."""
+    if not starts:
+        return {}
+    first = next(iter(starts.values()))
+    to_world = np.linalg.inv(moved_by_world(first.pose))
+    cov = to_world @ first.cov @ to_world.T
+    return {
+        name: start if start is first or name in given else in_world(start, cov)
+        for name, start in starts.items()
+    }
 
 
 def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"]) -> dict[str, str]:

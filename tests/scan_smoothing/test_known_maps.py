@@ -11,7 +11,7 @@ from walls import rectangles
 import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
-from graphslam.core.geometry import between, rotate_cov, rotation3
+from graphslam.core.geometry import between, rotate_cov, rotation3, wrap
 from graphslam.mapping.known_map import latest_places
 from graphslam.mapping.landmark_records import ALONG, SHORTEST_M
 from graphslam.results.folder import JOINT_FILE
@@ -191,6 +191,29 @@ def test_a_continued_map_is_better_and_names_its_parent(tmp_path, first_day):
     dims = np.cumsum([0, *(len(before.known.means[number]) for number in kept)])[:-1]
     # widening may cost a wall that was not seen again a little
     assert np.median(np.diag(now)[dims + 1] / np.diag(was)[dims + 1]) < 1.0
+
+
+def test_where_a_map_is_in_the_world_no_later_day_tells(tmp_path):
+    """Of a start that was told with the default sigmas, or the map would seem to be known better.
+
+    Nor does it move: a start in the map that is pulled to the world would turn all of it.
+    """
+    told = {"start.poses.robot": [5.0, 1.7, 0.0]}
+    log = drive(tmp_path / "first.mcap", room=FURNISHED)
+    first = graphslam.smooth(log, output=tmp_path / "day0", **told)
+    sigma = graphslam.load_config().start.given_sigma_rad
+    for day in (1, 2):
+        log = drive(tmp_path / f"{day}.mcap", room=FURNISHED, phase=0.4 * day, seed=day)
+        update = {"known_map.update": True, "output": tmp_path / f"day{day}"}
+        later = localised(log, tmp_path / f"day{day - 1}", **update)
+        # a start tells a hundredth of that again, by its inflation, and the drive next to nothing
+        assert later.robots["robot"].final.covs[0, 2, 2] ** 0.5 > 0.95 * sigma
+        common = later.estimate.landmarks.keys() & first.estimate.landmarks.keys()
+        walls = [n for n in common if len(later.estimate.landmarks[n][0]) == 3]
+        was, now = (
+            np.array([one.estimate.landmarks[n][0][2] for n in walls]) for one in (first, later)
+        )
+        assert abs(np.median(wrap(now - was))) < 0.05 * sigma
 
 
 def test_landmarks_of_a_continued_map_are_those_of_its_joint_gaussian(tmp_path, first_day):

@@ -62,6 +62,19 @@ def test_sessions_that_begin_anywhere_are_one_map(tmp_path):
     assert len(result.landmarks) < 20
 
 
+def test_where_the_first_session_is_in_the_world_no_other_tells(tmp_path):
+    """Starts that were found in its map would, each anew, if they were known in the world."""
+    told = {"start.poses.day0": true_pose(0.0).tolist()}  # with the default sigmas
+    result = graphslam.smooth(sessions(tmp_path, *[FURNISHED] * 3), config=SAME_PLACE, **told)
+    assert set(result.summary["frames"].values()) == {"day0"}
+    sigma = graphslam.load_config().start.given_sigma_rad
+    # each start tells a hundredth of it again, by its inflation
+    assert result.robots["day0"].final.covs[0, 2, 2] ** 0.5 > 0.95 * sigma
+    assert all(
+        found["sigma_rad"] < 0.2 * sigma for found in result.summary["starts_found"].values()
+    )
+
+
 def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):
     """Of two relative poses that explain everything neither may be taken; it is said why."""
     days = sessions(tmp_path, rectangles(*BOX), rectangles(*BOX))
