@@ -114,7 +114,7 @@ def follow(
                 folder.write(state)
         if not len(folder.history):
             raise LogError(f"{path}: {state}, and nothing could be estimated; see `graphslam info`")
-        return folder.write(state, growing.recording())
+        return folder.write(state, growing.recording(is_over=True))
 
 
 def _opened(

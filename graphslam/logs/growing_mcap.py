@@ -3,12 +3,13 @@
 import os
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
 from graphslam.core.errors import LogError
 from graphslam.core.sensor_config import LimitsConfig
-from graphslam.logs.mcap_chunks import DAMAGE
+from graphslam.logs.mcap_chunks import DAMAGE, RECORD
 from graphslam.logs.mcap_file import MAGIC, Indexer, block_messages, records_from
 from graphslam.logs.recording import RawMessage, Recording
 from graphslam.logs.translations import translation
@@ -33,6 +34,7 @@ class GrowingMcap:
         self._indexer = Indexer(path, stream, limits)
         self._last = b""  # the beginning of the record read last, which is at the indexer's place
         self._given = 0  # blocks
+        self._end = len(MAGIC)  # of the record read last
 
     def __enter__(self) -> "GrowingMcap":
         return self
@@ -53,6 +55,7 @@ class GrowingMcap:
                 if self._last and offset == begin:
                     continue  # the one read last
                 indexer.position, grown = offset, True
+                self._end = offset + RECORD.size + len(body)
                 indexer.add(offset, opcode, body)
             self.ended = True
         except DAMAGE:
@@ -63,9 +66,16 @@ class GrowingMcap:
             self._last = self._stream.read(_KNOWN_AGAIN)
         return grown
 
-    def recording(self) -> Recording:
-        """What was read so far, as a recording."""
-        return Recording(self.path, (self._indexer.result(),))
+    def recording(self, *, is_over: bool = False) -> Recording:
+        """What was read so far, as a recording.
+
+        ``is_over``: nothing is added any more. What cannot be read at its end then is damage.
+        """
+        piece, left = self._indexer.result(), self._size() - self._end
+        if is_over and not self.ended and left > 0:
+            text = f"{left} bytes from byte {self._end} on are no whole record"
+            piece = replace(piece, damage="; ".join(filter(None, (piece.damage, text))), lost=None)
+        return Recording(self.path, (piece,))
 
     def kinds(self) -> dict[str, tuple[str, str]]:
         """Schema and encoding of the topics that are described so far, see `RawTopic`."""
@@ -106,7 +116,10 @@ class GrowingMcap:
         grown = longer = time.monotonic()  # by records, and by bytes
         size = self._size()
         while True:
-            yield from self.new_blocks()
+            for batch in self.new_blocks():
+                yield batch
+                # what was added while it was worked on need not be whole yet
+                grown = longer = time.monotonic()
             if self.ended:
                 return
             if self._size() != size:

@@ -14,6 +14,7 @@ from graphslam.core.geometry import wrap
 from graphslam.core.records import OdometryPose, Scan
 from graphslam.live import follow as follow_module
 from graphslam.logs import LogWriter, growing_mcap
+from graphslam.logs.mcap_file import MAGIC, records_from
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +113,22 @@ def test_a_recording_that_grows_by_what_cannot_be_read_is_damaged(room, tmp_path
     with pytest.raises(graphslam.LogError, match="grows, but is damaged: nothing can be read from"):
         graphslam.follow(recorder.path, tmp_path / "out", live={"wait_s": 4.0})
     assert len(graphslam.load_result(tmp_path / "out").robots["robot"].final) > 20
+
+
+def test_a_finished_recording_that_is_damaged_is_read_until_there_and_said_so(room, tmp_path):
+    """And not that it stopped growing: half of it would be lost without a word."""
+    path = tmp_path / "now.mcap"
+    with room.open("rb") as stream:
+        begins = [begin for begin, *_ in records_from(stream, len(MAGIC))]
+    whole = bytearray(room.read_bytes())
+    middle = next(begin for begin in begins if begin > len(whole) // 2)
+    whole[middle : middle + 400] = b"\x99" * 400
+    path.write_bytes(whole)
+    told = graphslam.follow(path, tmp_path / "out", live={"wait_s": 0.5})
+    assert told["live"]["state"] == "has not grown for 0.5 s"
+    assert 20 < told["live"]["estimates"] < 61
+    (warning,) = [warning for warning in told["warnings"] if "damaged" in warning]
+    assert "are no whole record" in warning
 
 
 def test_ctrl_c_ends_the_following(room, tmp_path):

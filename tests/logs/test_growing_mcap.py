@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 from itertools import chain
 
 import numpy as np
@@ -131,6 +132,23 @@ def test_reading_ends_when_nothing_comes(half, monkeypatch):
     assert sum(map(len, batches)) > 50
     assert max(map(len, batches)) < 0.2 * sum(map(len, batches))
     assert 4.8 < max(idle) <= 5.0 + growing_mcap.POLL_S
+
+
+def test_what_was_not_whole_while_others_were_worked_on_is_no_damage(files, tmp_path):
+    """A batch takes longer than `wait_s`, and meanwhile half of the next chunk was written."""
+    whole = files["small chunks"].read_bytes()
+    path = tmp_path / "growing.mcap"
+    path.write_bytes(whole[: len(whole) // 2])
+    wait_s, count = 0.3, 0
+    with open_growing(path, LIMITS, 1.0) as growing:
+        for batch in growing.batches(wait_s):
+            count += len(batch)
+            if path.stat().st_size < len(whole) // 2 + 700:
+                with path.open("ab") as stream:  # chunks have 2000 bytes of messages
+                    stream.write(whole[len(whole) // 2 :][:700])
+                time.sleep(2 * wait_s)
+        assert not growing.ended
+    assert count > 50
 
 
 def test_other_files_are_refused_before_anything_is_made(tmp_path):
