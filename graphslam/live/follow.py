@@ -334,15 +334,18 @@ def _too_late(messages: int, scans: int, in_a_row: int) -> list[str]:
 
 
 def _astray(known_map: Mapping[str, Any] | None) -> list[str]:
-    """A line where hardly anything that is seen is in a known map."""
+    """Lines where a known map is doubtful itself, or hardly anything that is seen is in it."""
     if known_map is None:
         return []
+    name, verdict = known_map["name"], known_map["verdict"]
+    lines = [] if verdict == "good" else [f"the map {name} is {verdict} itself: see its report"]
     own, others = (known_map[f"observations_of_{of}"] for of in ("it", "others"))
     if own + others < ENOUGH_SEEN or own > FAMILIAR_SHARE * (own + others):
-        return []
+        return lines
     return [
-        f"{own} of {own + others} observations are of landmarks of the map {known_map['name']}: "
-        "it is another place, or the start that was given is wrong, or this part is not in the map"
+        *lines,
+        f"{own} of {own + others} observations are of landmarks of the map {name}: "
+        "it is another place, or the start that was given is wrong, or this part is not in the map",
     ]
 
 

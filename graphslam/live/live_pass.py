@@ -262,6 +262,7 @@ class LivePass(Pipeline):
         return {
             "name": known.name,
             "sha256": known.sha256,
+            "verdict": known.verdict,
             "landmarks": len(known.known.means),
             "seen": len(self.known_seen),
             "observations_of_it": self.on_map,

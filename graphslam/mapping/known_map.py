@@ -35,7 +35,7 @@ class KnownMap:
     of ``known`` neglects is small against the error of a day, but not against what is known of
     walls. ``places``: submaps at poses in the world. ``parents``: the maps that
     it continues, the first one first, name and sha256 each. ``is_world_given``: whether its world
-    frame was told by a start, and not only the first pose of a robot.
+    frame was told by a start, and not only the first pose of a robot. ``verdict`` on that result.
     """
 
     name: str
@@ -47,6 +47,7 @@ class KnownMap:
     itself: KnownLandmarks | None = None
     parents: tuple[tuple[str, str], ...] = ()
     is_world_given: bool = False
+    verdict: str = "good"
 
     @property
     def ancestry(self) -> tuple[tuple[str, str], ...]:

@@ -32,7 +32,7 @@ from graphslam.mapping.map_update import (
     without_days_biases,
 )
 from graphslam.mapping.submaps import SubmapPose, build_submaps
-from graphslam.results.file_formats import landmark_from_json, landmark_json
+from graphslam.results.file_formats import landmark_from_json, landmark_json, read_json
 from graphslam.results.folder import SavedResult, check_one_frame, load
 from graphslam.results.joint_file import UNREADABLE, joint_scans
 from graphslam.results.scans_file import SCANS_FILE, read_scans
@@ -106,7 +106,11 @@ def known_map_of(config: Config) -> KnownMap | None:
                 "known_map.update (--update): there is no map to continue; give --prior-map DIR"
             )
         return None
-    return load_known_map(Path(config.known_map.directory), config.scan_matching)
+    directory = Path(config.known_map.directory)
+    known_map = load_known_map(directory, config.scan_matching)
+    # results of earlier versions had none
+    verdict = read_json(directory / "summary.json").get("verdict", {}).get("verdict", "good")
+    return replace(known_map, verdict=verdict)
 
 
 def known_map_files(result: Result, earlier: KnownMap | None) -> list[tuple[str, bytes]]:

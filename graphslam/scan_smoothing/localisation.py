@@ -153,7 +153,7 @@ def check_given(
     if why:
         raise EstimationError(
             f"robot {robot}: does not begin in the map {known_map.name} where --start says: {why}; "
-            "give another map, or another start"
+            "give another map or start, or none: then all of the map is searched"
         )
     return placed, submaps
 

@@ -66,7 +66,10 @@ def summarise(
     """
     log, counts, known = pipeline.log, pipeline.counts, pipeline.known
     runs = pipeline.started
-    log_s = 1e-9 * (pipeline.last_ns - pipeline.first_ns)
+    spans_ns = [pipeline.last_ns - pipeline.first_ns]
+    if pipeline.given_config.logs.same_place:  # without the time between the sessions
+        spans_ns = [run.track.last_ns - run.track.first_ns for run in runs.values()]
+    log_s = 1e-9 * sum(spans_ns)
     scans, total = counts["scans"], max(pipeline.seconds["all"], 1e-9)
     all_dropped = Counter(log.dropped) + pipeline.dropped + pipeline.removed_returns
     left_out = sum(len(run.repeats.left_out) for run in runs.values())
@@ -184,6 +187,7 @@ def known_map_summary(pipeline: LogPass) -> dict[str, Any]:
         "known_map": {
             "name": known_map.name,
             "sha256": known_map.sha256,
+            "verdict": known_map.verdict,
             "doubt": pipeline.map_doubt,
             "parents": [{"name": name, "sha256": sha256} for name, sha256 in known_map.parents],
             "world_given": known_map.is_world_given,

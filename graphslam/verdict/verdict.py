@@ -244,8 +244,11 @@ def _doubled_walls(evidence: Evidence) -> Iterable[Reason]:
 
 
 def _known_map(evidence: Evidence) -> Iterable[Reason]:
-    """A place in a known map of which much speaks against it."""
+    """A known map that is doubtful itself, or a place in it of which much speaks against it."""
     known = evidence.summary.get("known_map", {})
+    if known.get("verdict", "good") != "good":
+        text = f"{known['name']}: the map is {known['verdict']} itself: see its report"
+        yield Reason("doubtful", "known map", known["name"], text)
     if known.get("doubt"):
         yield Reason("doubtful", "known map", known["name"], f"{known['name']}: {known['doubt']}")
 
@@ -256,6 +259,8 @@ def _unobserved(evidence: Evidence) -> Iterable[Reason]:
         if evidence.summary["closures"].get("used"):
             return
         text = "no landmark and no closure entered the estimate: this is dead reckoning by odometry"
+        if "known_map" in evidence.summary:
+            text += ", from where it was placed in the map"
         yield Reason("doubtful", "observations", "", text)
         return
     for name in evidence.unobserved:

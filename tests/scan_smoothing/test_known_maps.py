@@ -1,6 +1,7 @@
 """A log localised in the map of an earlier result of the same room."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -73,6 +74,18 @@ def test_a_start_anywhere_is_found_in_the_map(tmp_path, first_day, phase):
     told = result.summary["known_map"]
     assert told["seen"] >= 6  # the room's walls, and the box
     assert told["name"] == "first"
+
+
+def test_a_map_brings_the_verdict_on_its_result_along(tmp_path, first_day):
+    """What is placed in a bent map is no better than that."""
+    shutil.copytree(first_day, tmp_path / "bent")
+    summary = json.loads((tmp_path / "bent" / "summary.json").read_text(encoding="utf-8"))
+    summary["verdict"]["verdict"] = "doubtful"
+    (tmp_path / "bent" / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.3, seed=3)
+    told = localised(log, tmp_path / "bent").summary
+    assert told["known_map"]["verdict"] == told["verdict"]["verdict"] == "doubtful"
+    assert localised(log, first_day).summary["verdict"]["verdict"] == "good"
 
 
 def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):

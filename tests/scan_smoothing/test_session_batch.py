@@ -70,9 +70,6 @@ def test_where_the_first_session_is_in_the_world_no_other_tells(tmp_path):
     sigma = graphslam.load_config().start.given_sigma_rad
     # each start tells a hundredth of it again, by its inflation
     assert result.robots["day0"].final.covs[0, 2, 2] ** 0.5 > 0.95 * sigma
-    assert all(
-        found["sigma_rad"] < 0.2 * sigma for found in result.summary["starts_found"].values()
-    )
 
 
 def test_a_room_that_looks_the_same_turned_is_refused(tmp_path):

@@ -220,6 +220,12 @@ def test_a_point_whose_range_is_not_measured_has_not_moved(range_sigma_m, doubts
     assert len(told) == doubts
 
 
+def in_a_map(known):
+    """Evidence of a run with a known map."""
+    made = evidence()
+    return replace(made, summary={**made.summary, "known_map": known})
+
+
 def distorted(sweep, spacing):
     """Evidence of walls that are turned within scans."""
     distortion = ScanDistortion(sweep, spacing)
@@ -239,6 +245,10 @@ WRONG = {
     "a sweep that nobody told of": (
         lambda: distorted(Distortion(0.04, 30.0, 0.3, 0.013), Distortion(0.01, 20.0, 0.2, 0.01)),
         "one after the other in 0.04 s or more",
+    ),
+    "a known map that is doubtful": (
+        lambda: in_a_map({"name": "monday", "verdict": "doubtful"}),
+        "monday: the map is doubtful itself",
     ),
     "beams that are farther apart than is stated": (
         lambda: distorted(Distortion(0.04, 20.0, 0.2, 0.01), Distortion(0.01, 30.0, 0.3, 0.013)),
