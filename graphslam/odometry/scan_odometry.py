@@ -45,8 +45,6 @@ USUAL_OVERLAP, MIN_OVERLAP, MIN_OVERLAP_GAIN = 0.6, 0.5, 0.05
 #: of Intel's corrected motions all but one have 0.02 and more, right ones of a laser of 60° have
 #: none. And the share that is the same, if another one is right
 DENIED, THE_SAME = 0.01, 0.85
-#: ns between two scans from which on they need not have anything in common
-PAUSE_NS = 2_000_000_000
 #: points within so many cells of matched points of an observed line belong to it
 LINE_CELLS = 2.0
 
@@ -58,13 +56,18 @@ def scan_submap(points: Array, config: ScanMatchingConfig | None = None) -> Subm
     return make_submap(np.zeros((1, 3)), [np.asarray(points, dtype=float)], config)
 
 
-def checked_against_scans(motion: Motion, before: Submap, now: Submap) -> Motion:
+def checked_against_scans(
+    motion: Motion, before: Submap, now: Submap, *, has_paused: bool = False
+) -> Motion:
     """The motion, corrected by scan matching if the scans contradict it; see `check_motions`."""
-    return check_motions([motion], [before], [now])[0]
+    return check_motions([motion], [before], [now], [has_paused])[0]
 
 
 def check_motions(
-    motions: Sequence[Motion], before: Sequence[Submap], now: Sequence[Submap]
+    motions: Sequence[Motion],
+    before: Sequence[Submap],
+    now: Sequence[Submap],
+    have_paused: Sequence[bool] = (),
 ) -> list[Motion]:
     """Motions, corrected by scan matching where the scans contradict them (``from_scans``).
 
@@ -75,7 +78,9 @@ def check_motions(
         motions: according to odometry.
         before: scans of the states where they start, in these states' frames.
         now: scans of the states where they end.
+        have_paused: whether the laser has, between the two; without, it never has.
     """
+    have_paused = have_paused or [False] * len(motions)
     here, steps, covs = fits(now, before, [m.delta for m in motions])
     checked = list(motions)
     left = [
@@ -88,7 +93,8 @@ def check_motions(
     for k, match in zip(left, match_motions(*some, here[left]), strict=True):
         if match is not None:
             motion = _corrected(motions[k], match.pose, match.cov, before[0].config)
-            if not match.searched or is_denied(now[k], before[k], motions[k], match.pose):
+            ends = now[k], before[k], motions[k].delta, match.pose
+            if not match.searched or is_denied(*ends, has_paused=have_paused[k]):
                 checked[k] = motion
     return checked
 
@@ -104,20 +110,22 @@ class ScanMatch(NamedTuple):
     searched: bool
 
 
-def is_denied(now: Submap, before: Submap, motion: Motion, other: Array) -> bool:
-    """Whether scans deny a motion where they lie better on each other at one far off (3,).
+def is_denied(
+    now: Submap, before: Submap, delta: Array, other: Array, *, has_paused: bool = False
+) -> bool:
+    """Whether scans deny a motion (3,) where they lie better on each other at one far off (3,).
 
     They do if each sees through what the other saw, or if nearly all of them is the same at the
     other motion. Where a laser sees a narrow part and turns, much of a scan is out of sight of the
     other, and a wrong motion may lay more of it onto that than the right one.
 
-    After a pause of the laser (`PAUSE_NS`) the robot may have driven to where nothing is as before,
-    or through a corridor that looks like itself at any motion, none at all included. So the other
-    motion is right only if the scans do not see through each other there.
+    If the laser ``has_paused``, the robot may have driven to where nothing is as before, or through
+    a corridor that looks like itself at any motion, none at all included. So the other motion is
+    right only if the scans do not see through each other there.
     """
-    _, through = agreement(now, before, motion.delta)
+    _, through = agreement(now, before, delta)
     same, elsewhere = agreement(now, before, other)
-    if motion.end_ns - motion.start_ns > PAUSE_NS and elsewhere >= DENIED:
+    if has_paused and elsewhere >= DENIED:
         return False
     return through >= DENIED or same >= THE_SAME
 

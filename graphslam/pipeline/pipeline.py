@@ -306,7 +306,7 @@ class Pipeline(StepRecorder):
         left_out = isinstance(first, Scan) and run.repeats.leaves_out(first, run.track)
         if isinstance(first, Scan):  # an event of its own
             first, *_ = event = undistorted_by_track([first], run.track)
-        run.scans += [(m.stamp_ns, m.time_ns, m.mount) for m in event if isinstance(m, Scan)]
+        run.note_scans(message for message in event if isinstance(message, Scan))
         self.counts["scans"] += isinstance(first, Scan)
         if left_out:
             return  # but where the robot was is reported
@@ -350,7 +350,8 @@ class Pipeline(StepRecorder):
         if motion is None or now is None or last is None or last[0] != motion.start_ns:
             return motion, None
         run.motions += 1
-        motion = checked_against_scans(motion, last[1], now)
+        has_paused = scan.time_ns in run.resumed_ns
+        motion = checked_against_scans(motion, last[1], now, has_paused=has_paused)
         run.contradicted += motion.from_scans
         if self.config.odometry.scan_matching == "auto" or motion.from_scans:
             return motion, None

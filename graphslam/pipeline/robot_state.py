@@ -38,6 +38,8 @@ from graphslam.pipeline.scans_since_keyframe import ScansSinceKeyframe
 BASE_RATE_HZ = 10
 #: poses are not reported in gaps of the odometry that are longer, though the robot stands in them
 LONGEST_GAP_NS = 600_000_000_000
+#: ns between two scans from which on they need not have anything in common
+PAUSE_NS = 2_000_000_000
 
 
 @dataclass(slots=True, eq=False)
@@ -55,7 +57,8 @@ class RobotState:
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
     many of ``motions`` the scans contradicted; ``lost``: times of consecutive scans that have
-    nothing in common, see `ComparedScans`. ``repeats``: scans that are reported and not used.
+    nothing in common, see `ComparedScans`; ``resumed_ns``: of scans that came after a pause of the
+    laser. ``repeats``: scans that are reported and not used.
     Times are of the common clock, stamps of the robot's own ``clock``.
     """
 
@@ -80,6 +83,8 @@ class RobotState:
     kept_ns: int | None = None
     has_scans: bool = True
     since_keyframe: ScansSinceKeyframe | None = None
+    resumed_ns: set[int] = field(default_factory=set)
+    _latest_scan_ns: int | None = None
 
     def __post_init__(self) -> None:
         """Calibrate the track's odometry by its own settings."""
@@ -94,6 +99,14 @@ class RobotState:
     def state_ns(self) -> int:
         """Time of the latest state; -1 before the first."""
         return self.times[-1] if self.times else -1
+
+    def note_scans(self, scans: Iterable[Scan]) -> None:
+        """Take in scans of the first laser in the order of time, used or not."""
+        for scan in scans:
+            last_ns, self._latest_scan_ns = self._latest_scan_ns, scan.time_ns
+            if last_ns is not None and scan.time_ns - last_ns > PAUSE_NS:
+                self.resumed_ns.add(scan.time_ns)
+            self.scans.append((scan.stamp_ns, scan.time_ns, scan.mount))
 
     def keep_between(self, scan: Scan) -> None:
         """Keep beams of a scan that gets no state, if the robot drove since the last one."""

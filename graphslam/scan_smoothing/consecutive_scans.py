@@ -1,6 +1,6 @@
 """Each scan of a robot's first laser compared with the one before, where odometry puts it."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +43,11 @@ class ConsecutiveScans:
         self._known: dict[Span, tuple[bool, float]] = {}
 
     def compare(
-        self, scans: Sequence[Scan], motions: Sequence[Motion | None], points: Sequence[Array]
+        self,
+        scans: Sequence[Scan],
+        motions: Sequence[Motion | None],
+        points: Sequence[Array],
+        resumed_ns: Collection[int] = (),
     ) -> ComparedScans:
         """The pairs of a block; may be asked for again, with scans added.
 
@@ -51,6 +55,7 @@ class ConsecutiveScans:
             scans: of all lasers that have a state.
             motions: by odometry, of each since the state before; None if that has the same time.
             points: (k, 2) returns of each, in the order of the beams.
+            resumed_ns: times of scans that came after a pause of the laser.
         """
         last_ns, last_points = self._last
         times, clouds, pairs = [last_ns], [last_points], []
@@ -66,7 +71,9 @@ class ConsecutiveScans:
             clouds.append(points[n])
             enough = min(len(clouds[-2]), len(clouds[-1])) >= MIN_POINTS
             if motion is not None and begin == motion.start_ns and enough:
-                pairs.append((len(times) - 1, ScanPair(before, n, motion, part, suspect=False)))
+                has_paused = scan.time_ns in resumed_ns
+                pair = ScanPair(before, n, motion, part, suspect=False, has_paused=has_paused)
+                pairs.append((len(times) - 1, pair))
             before = n
         found = self._found([pair.motion for _, pair in pairs], clouds, [k for k, _ in pairs])
         return ComparedScans(

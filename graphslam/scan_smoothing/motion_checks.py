@@ -42,7 +42,8 @@ class ScanPair(Record):
 
     ``before`` and ``now`` are numbers of keyframes in a block, ``before`` -1 where it is the last
     such scan of the blocks before. If states of other lasers are between the two, ``earlier`` is
-    the part of the motion up to the last of these. ``suspect``: the scans may contradict it.
+    the part of the motion up to the last of these. ``suspect``: the scans may contradict it;
+    ``has_paused``: the laser, in between.
     """
 
     before: int
@@ -50,6 +51,7 @@ class ScanPair(Record):
     motion: Motion
     earlier: Motion | None
     suspect: bool
+    has_paused: bool = False
 
 
 class MotionChecker:
@@ -87,6 +89,7 @@ class MotionChecker:
             [pair.motion for pair in suspect],
             [submaps[pair.before] for pair in suspect],
             [submaps[pair.now] for pair in suspect],
+            [pair.has_paused for pair in suspect],
         )
         whole = {pair.now: pair.motion for pair in pairs}
         for pair, motion in zip(suspect, better, strict=True):

@@ -257,7 +257,7 @@ class _Reader:
         """Keyframes, pairs to be compared, and the last of the first laser, see `KeyframeBlock`."""
         track = self.run.track
         scans = [message for message in block if isinstance(message, Scan)]
-        self.run.scans += [(s.stamp_ns, s.time_ns, s.mount) for s in scans if not s.sensor]
+        self.run.note_scans(scan for scan in scans if not scan.sensor)
         self._counts["scans"] += len(scans)
         each: list[Scan] = []
         for sensor, laser in self._lasers.items():
@@ -306,8 +306,9 @@ class _Reader:
         self, images: Sequence["_Image"], motions: Sequence[Motion | None]
     ) -> ComparedScans:
         with timed(self._seconds, "scan matching"):
+            points = [image.points for image in images]
             return self._consecutive.compare(
-                [i.scan for i in images], motions, [i.points for i in images]
+                [image.scan for image in images], motions, points, self.run.resumed_ns
             )
 
     def _scans_to_add(self, compared: ComparedScans) -> list[Scan]:
