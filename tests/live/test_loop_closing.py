@@ -7,17 +7,10 @@ from walls import L_ROOM, cloud
 from graphslam.core.config import BackendConfig, Config
 from graphslam.core.geometry import between, wrap
 from graphslam.core.records import KeyframeScan, Motion, Start, Step
-from graphslam.core.worker import allow_fork
 from graphslam.estimation.fixed_lag import FixedLagBackend
 from graphslam.live.loop_closing import LoopCloser
 
 S = 1_000_000_000
-
-
-@pytest.fixture(autouse=True)
-def _in_this_process():
-    """When a second process answers depends on how busy the machine is."""
-    allow_fork(second=False)
 
 
 CONFIG = Config(backend=BackendConfig(name="isam2", horizon_s=10.0))
