@@ -21,6 +21,7 @@ from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array
 from graphslam.core.information_root import InformationRoot
 from graphslam.core.mount_covariances import MountCovariances
+from graphslam.core.record import replace
 
 if TYPE_CHECKING:  # what reads the root of a folder needs no GTSAM
     from graphslam.estimation.selected_inverse import CliqueRows
@@ -178,6 +179,34 @@ def _substituted(
         if root.above[c] >= 0:
             below[int(root.above[c])].append((separator, use, b[n:] - block[:, n:].T @ y))
         yield use, y
+
+
+def in_other_axes(root: InformationRoot, axes: Mapping[int, Array]) -> InformationRoot:
+    """The root of the same information about errors of some variables along other axes.
+
+    ``axes``: first row of a variable -> (3, 3), which takes its errors along the new axes to those
+    along the old ones.
+    """
+    starts = np.concatenate([[0], np.cumsum(root.own)])
+    widths = np.concatenate([[0], np.cumsum(root.width)])
+    ends = np.concatenate([[0], np.cumsum(root.own * (root.own + root.width))])
+    turned, values = np.zeros(int(starts[-1]), dtype=np.bool_), root.values.copy()
+    turned[list(axes)] = True
+    for c, (n, m) in enumerate(zip(root.own.tolist(), root.width.tolist(), strict=True)):
+        separator = root.separators[widths[c] : widths[c + 1]]
+        held = np.concatenate([np.arange(starts[c], starts[c + 1]), separator])
+        at = np.flatnonzero(turned[held]).tolist()
+        if not at:
+            continue
+        block = values[ends[c] : ends[c + 1]].reshape(n, n + m)
+        for k in at:  # the rows of a variable follow each other
+            block[:, k : k + 3] = block[:, k : k + 3] @ axes[int(held[k])]
+        if at[0] < n:  # it is to be triangular again
+            block[:] = np.linalg.qr(block[:, :n])[0].T @ block
+    shared = root.shared.copy()
+    for first, turn in axes.items() if shared.size else ():
+        shared[first : first + 3] = np.linalg.solve(turn, shared[first : first + 3])
+    return replace(root, values=values, shared=shared)
 
 
 def solve_root(root: InformationRoot, right: Array) -> Array:

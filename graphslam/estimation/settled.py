@@ -12,8 +12,10 @@ import gtsam
 import numpy as np
 
 from graphslam.core.config import RobustConfig
+from graphslam.core.geometry import adjoint, between
 from graphslam.core.records import Estimate, Step, Trajectory
 from graphslam.estimation import factors
+from graphslam.estimation.joint_covariances import in_other_axes
 from graphslam.estimation.optimisation import CONVERGED_ERROR, is_wide, optimise
 from graphslam.estimation.recorded_graph import RecordedGraph
 
@@ -83,7 +85,12 @@ def _best_of_several(
 
 
 def moved_to(minimum: Estimate, estimate: Estimate) -> Estimate:
-    """The estimate with the poses and landmarks of its ``minimum``; covariances stay its own."""
+    """The estimate with the poses and landmarks of its ``minimum``; covariances stay its own.
+
+    Walls slide along themselves by decimetres, where nothing holds them. Their errors are along
+    their own axes, at their own place, so the root of the information is given in the new ones: in
+    the old ones it would hold a map that is turned as a whole.
+    """
     states = {
         robot: replace(own, poses=minimum.states[robot].poses)
         for robot, own in estimate.states.items()
@@ -92,7 +99,18 @@ def moved_to(minimum: Estimate, estimate: Estimate) -> Estimate:
         number: (minimum.landmarks[number][0], cov)
         for number, (_, cov) in estimate.landmarks.items()
     }
-    return replace(estimate, states=states, landmarks=landmarks)
+    root = estimate.root
+    if root is not None:
+        walls = [n for n in root.landmarks if len(estimate.landmarks[n][0]) == 3]
+        old, new = (
+            np.array([one.landmarks[n][0] for n in walls]).reshape(-1, 3)
+            for one in (estimate, minimum)
+        )
+        moves = adjoint(between(old, new))
+        root = in_other_axes(
+            root, {root.landmarks[n]: m for n, m in zip(walls, moves, strict=True)}
+        )
+    return replace(estimate, states=states, landmarks=landmarks, root=root)
 
 
 def _hold_lines(builder: RecordedGraph, values: gtsam.Values) -> None:
