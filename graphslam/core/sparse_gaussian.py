@@ -29,6 +29,8 @@ def sparse_root(cov: Array, dims: Sequence[int]) -> SparseRoot:
         dims: of the n variables; the less neighbours in this order have in common with the rest
             given each other, the less is neglected.
     """
+    if not len(dims):
+        return SparseRoot((), (), 1.0)
     count = PARENTS
     while True:
         found = _root(cov, dims, count)

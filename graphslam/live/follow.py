@@ -2,6 +2,7 @@
 
 import math
 import os
+import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -246,7 +247,15 @@ class _Folder:
             summary,
         )
         self._began_s, self._estimates = time.monotonic(), len(self.history)
-        self._writing = Future(lambda: (write(), identity(self._target))[1])
+        here = os.getpid()
+
+        def written() -> Identity:
+            if os.getpid() != here:  # Ctrl-C, which every process gets, ends the following alone
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+            write()
+            return identity(self._target)
+
+        self._writing = Future(written)
         return summary
 
     def _finish(self) -> None:

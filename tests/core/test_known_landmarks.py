@@ -3,7 +3,7 @@
 import numpy as np
 
 from graphslam.core.geometry import adjoint, compose, exp, inverse
-from graphslam.core.known_landmarks import MOST_HOLDING, KnownLandmarks
+from graphslam.core.known_landmarks import MOST_HOLDING, UNKNOWN, KnownLandmarks
 from graphslam.core.sparse_gaussian import sparse_root
 
 
@@ -78,3 +78,10 @@ def test_rows_of_the_pose_are_those_of_the_motion_of_all():
     errors = np.concatenate([adjoint(inverse(known.means[n])) @ twist for n in numbers])
     information = np.linalg.inv(known.pose_covariance())
     assert np.isclose((rows @ errors) @ (rows @ errors), twist @ information @ twist, rtol=1e-6)
+
+
+def test_a_map_without_landmarks_is_known_nowhere():
+    """All of it was retired, and nothing new seen."""
+    known = KnownLandmarks({}, (), sparse_root(np.zeros((0, 0)), []))
+    assert known.rows() == []
+    np.testing.assert_allclose(known.pose_covariance(), UNKNOWN**2 * np.eye(3))

@@ -1,6 +1,7 @@
 """A recording that is estimated while it is written, and the folder of it."""
 
 import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from room_log import SCAN, S, drive
 import graphslam
 from graphslam.core.geometry import wrap
 from graphslam.core.records import OdometryPose, Scan
+from graphslam.core.worker import allow_fork, can_fork
 from graphslam.live import follow as follow_module
 from graphslam.logs import LogWriter, growing_mcap
 from graphslam.logs.mcap_file import MAGIC, records_from
@@ -129,6 +131,25 @@ def test_a_finished_recording_that_is_damaged_is_read_until_there_and_said_so(ro
     assert 20 < told["live"]["estimates"] < 61
     (warning,) = [warning for warning in told["warnings"] if "damaged" in warning]
     assert "are no whole record" in warning
+
+
+def test_ctrl_c_does_not_end_the_writing_of_the_folder(room, tmp_path, monkeypatch):
+    """It would be begun anew, and take what it has just written for another program's."""
+    allow_fork()
+    if not can_fork():
+        pytest.skip("no second process here")
+    here, real, sent = os.getpid(), follow_module.identity, tmp_path / "sent"
+
+    def interrupted(folder):
+        if os.getpid() != here:
+            sent.touch()
+            os.kill(os.getpid(), signal.SIGINT)
+        return real(folder)
+
+    monkeypatch.setattr(follow_module, "identity", interrupted)
+    told = graphslam.follow(room, tmp_path / "out")
+    assert sent.exists() and told["live"]["state"] == "ended"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "sent"]
 
 
 def test_ctrl_c_ends_the_following(room, tmp_path):
