@@ -13,6 +13,8 @@ import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import ConfigError, EstimationError, OutputError
 from graphslam.core.geometry import between, rotate_cov, rotation3, wrap
+from graphslam.core.information_root import InformationRoot
+from graphslam.core.records import JointScans, Landmark
 from graphslam.mapping.known_map import latest_places
 from graphslam.mapping.landmark_records import ALONG, SHORTEST_M
 from graphslam.results.folder import JOINT_FILE
@@ -227,6 +229,21 @@ def test_where_a_map_is_in_the_world_no_later_day_tells(tmp_path):
             np.array([one.estimate.landmarks[n][0][2] for n in walls]) for one in (first, later)
         )
         assert abs(np.median(wrap(now - was))) < 0.05 * sigma
+
+
+def test_biases_of_surfaces_are_not_in_what_is_known_of_a_map():
+    """On another day they are the same, and do the same to the path: see docs/known-maps.md."""
+    one, none = np.array([3]), np.zeros(0, dtype=np.int64)
+    shared = np.array([[0.0], [0.3], [0.1]])
+    root = InformationRoot(
+        one - 4, one, 0 * one, none, np.eye(3).ravel(), {}, {7: 0}, shared=shared
+    )
+    at, none_seen = np.array([1.0, 0.0, 1.6]), (None, 0, 0, 0, None)
+    wall = Landmark(7, "line", at, np.eye(3), np.zeros((2, 2)), *none_seen)
+    joint = JointScans(root, {}, {})
+    own = landmark_covariance(joint, [wall], biases=False)
+    np.testing.assert_allclose(own, np.eye(3))
+    np.testing.assert_allclose(landmark_covariance(joint, [wall]), own + shared @ shared.T)
 
 
 def test_landmarks_of_a_continued_map_are_those_of_its_joint_gaussian(tmp_path, first_day):

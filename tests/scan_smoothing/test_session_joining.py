@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from graphslam.core.geometry import between, compose
 from graphslam.core.records import Start
 from graphslam.multi_robot.hypothesis_choice import Refusal, Telling
 from graphslam.scan_smoothing import session_joining
@@ -116,3 +117,27 @@ def test_hypotheses_about_a_group_are_as_many_however_many_sessions_it_has(monke
     found = session_joining._hypotheses(group("a"), group(*far), sessions)
     assert len(found) == MAX_LAID
     assert np.allclose(found[0]["g"].pose, 0)
+
+
+def test_told_starts_are_of_bases_whatever_the_mounts():
+    """States are sensors' poses, and the first session's begins where its base is told to be.
+
+    So between two sensors it is as their mounts at the told bases say.
+    """
+    mounts = {"mon": np.array([0.4, 0.1, 0.2]), "tue": np.array([-0.2, 0.3, -1.0])}
+    told = {
+        "mon": Start(np.array([5.0, 2.0, 1.0]), np.eye(3)),
+        "tue": Start(np.array([-3.0, 1.0, 2.5]), np.eye(3)),
+    }
+    sessions = {
+        name: SimpleNamespace(
+            runs={
+                name: SimpleNamespace(track=SimpleNamespace(mount=mount, mount_cov=0 * np.eye(3)))
+            }
+        )
+        for name, mount in mounts.items()
+    }
+    first, later = (session_joining._of_first_state(sessions, n, "mon", told) for n in mounts)
+    np.testing.assert_allclose(first.pose, told["mon"].pose)
+    sensors = [compose(told[name].pose, mount) for name, mount in mounts.items()]
+    np.testing.assert_allclose(between(first.pose, later.pose), between(*sensors), atol=1e-12)
