@@ -220,6 +220,16 @@ def test_a_point_whose_range_is_not_measured_has_not_moved(range_sigma_m, doubts
     assert len(told) == doubts
 
 
+def test_walls_that_dead_reckoning_does_not_join_say_nothing_of_the_laser():
+    """They are where its drift has put them."""
+    made = distorted(Distortion(0.3, 30.0, 0.3, 0.013), Distortion())
+    graph = {"error_without_kernels": 0.0, "dof": 0}
+    assert (
+        "one after the other"
+        not in reasons(replace(made, summary={**made.summary, "graph": graph}))[1]
+    )
+
+
 def in_a_map(known):
     """Evidence of a run with a known map."""
     made = evidence()
