@@ -124,7 +124,8 @@ def write_part(source: Path, make: Make, part: str, path: Path) -> None:
 
 def row_of(kind: str, name: str, path: Path) -> dict[str, Any]:
     """The verdicts on a log."""
-    began, config = time.process_time(), load_config(overrides=SETTINGS.get(kind, SETTINGS.get(name, ())))
+    began, settings = time.process_time(), SETTINGS.get(kind, SETTINGS.get(name, ()))
+    config = load_config(overrides=settings)
     result = smooth(open_logs([path], config), config)
     alone = result.summary["verdict"]
     row = {"kind": kind, "log": name, "verdict": alone["verdict"], "reasons": alone["reasons"]}
