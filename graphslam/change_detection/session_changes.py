@@ -10,7 +10,7 @@ from graphslam.change_detection.alignment import laser_warnings
 from graphslam.change_detection.detect import detect_changes, identity_registration
 from graphslam.change_detection.visit import Visit, visit_from_scans
 from graphslam.core.errors import OutputError
-from graphslam.core.geometry import Array, between, compose
+from graphslam.core.geometry import Array, between, compose, moved_by_world
 from graphslam.core.record import replace
 from graphslam.core.records import KeyframeScan, Result, Trajectory
 from graphslam.core.thinning import evenly_thinned
@@ -82,9 +82,7 @@ def _in_the_map(poses: Array, covs: Array, origin: Trajectory) -> Array:
 
     How well the first pose of all is known is an error of the world, of which all have the same.
     """
-    J = np.tile(np.eye(3), (len(poses), 1, 1))
-    J[:, 0, 2] = origin.poses[0, 1] - poses[:, 1]
-    J[:, 1, 2] = poses[:, 0] - origin.poses[0, 0]
+    J = moved_by_world(poses - [*origin.poses[0, :2], 0.0])
     values, axes = np.linalg.eigh(covs - J @ origin.covs[0] @ J.mT)
     kept = axes @ (np.maximum(values, 0.0)[:, :, None] * axes.mT)
     return np.asarray(kept + np.diag(LEAST_SIGMAS**2))

@@ -245,7 +245,7 @@ class Start(Record):
     """Prior of a robot's first state: pose (3,), cov (3, 3) along world axes.
 
     ``base_cov``: ``cov`` without the sensor's mount, where the start of the base was told.
-    ``world_cov``: that by which covariances are, where ``cov`` is relative to a map.
+    ``world_cov``: ``cov`` with what is not known of where the map lies that ``cov`` is relative to.
     """
 
     pose: Array

@@ -15,7 +15,7 @@ import numpy as np
 from graphslam.core.arrays import IntArray
 from graphslam.core.config import RobustConfig
 from graphslam.core.geometry import Array, are_positive
-from graphslam.core.known_landmarks import UNKNOWN, KnownLandmarks
+from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.observation_models import MODELS
 from graphslam.core.records import Association, Estimate, Motion, Start, Step
 from graphslam.estimation import factors
@@ -163,7 +163,7 @@ class RecordedGraph(BatchGraph):
         map. Covariances have neither: they would tell what nobody measured.
         """
         for index, numbers, rows, known in self._held:
-            scale = 1.0 / UNKNOWN if in_world else 1.0 / HELD
+            scale = 0.0 if in_world else 1.0 / HELD
             factor = factors.known_landmark_factor(numbers, scale * rows, known.means)
             self.graph.replace(index, factor)
         for index, start in self._relative_starts:

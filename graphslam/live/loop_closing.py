@@ -4,10 +4,9 @@ Landmarks are recognised where the estimate says that they are. Where it has dri
 knows, a place that is passed again would be mapped a second time. So scans are compared as well: a
 state every few metres is kept with the scans around it, as a *place*, and each new one is searched
 for in those that may be the same (`mapping.loop_closure`), pair by pair with the next scans. What
-two searches agree on becomes a closure between two kept states. The estimate then
-moves at once, and says so. It only has to come near enough for landmarks to be recognised, which
-tell more and come from the same scans: so a closure enters far less certain than its match
-(`CLOSURE_INFLATION`).
+two searches agree on becomes a closure between two kept states. The estimate then moves at once,
+and says so. It only has to come near enough for landmarks to be recognised, which tell more and
+come from the same scans: so a closure enters far less certain than its match (`CLOSURE_INFLATION`).
 
 Places stay, one where several are near each other; of each of the others three dormant variables
 may be left.

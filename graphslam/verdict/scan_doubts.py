@@ -22,7 +22,7 @@ CONTRADICTED, IN_A_ROW, ROW = 0.12, 8, 12
 CURVED = 0.15
 #: sigmas, share of the squared residuals, and rad: of walls turned within scans by a sweep, and by
 #: the spacing of beams; of healthy logs up to 7, 0.03 and 0.004
-SWEEP, SPACING = (10.0, 0.1, 0.005), (10.0, 0.1, 0.005)
+DISTORTED = 10.0, 0.1, 0.005
 #: ns without a scan, and usual times between two, in which a robot may be carried
 UNSEEN_NS, UNSEEN_SCANS = 1_000_000_000, 3
 #: ns without a scan in which a robot may stop and start again; m and rad that one which drives
@@ -153,7 +153,7 @@ def _distorted(robot: RobotEvidence) -> Iterator[Reason]:
     """Of the two causes of walls that are turned within scans, that which explains more."""
     sweep, spacing = robot.distortion
     doubtful = "the map may be wrong by far more than is stated"
-    if _is_beyond(sweep, SWEEP) and sweep.share >= spacing.share:
+    if _is_told(sweep) and sweep.share >= spacing.share:
         text = (
             f"{robot.name}: where it turns, the walls of a scan are turned against each other, as "
             f"by beams that are measured one after the other in {abs(sweep.value):.2f} s or more "
@@ -163,7 +163,7 @@ def _distorted(robot: RobotEvidence) -> Iterator[Reason]:
             "during a sweep"
         )
         yield Reason("doubtful", "scans", robot.name, text)
-    elif _is_beyond(spacing, SPACING):
+    elif _is_told(spacing):
         which = "farther apart" if spacing.value > 0 else "closer together"
         text = (
             f"{robot.name}: the walls on one side of its scans are turned against those on the "
@@ -174,9 +174,9 @@ def _distorted(robot: RobotEvidence) -> Iterator[Reason]:
         yield Reason("doubtful", "scans", robot.name, text)
 
 
-def _is_beyond(found: Distortion, limits: tuple[float, float, float]) -> bool:
-    """Whether sigmas, share and rad are above limits."""
-    return all(np.array([found.sigmas, found.share, found.rms_rad]) > limits)
+def _is_told(found: Distortion) -> bool:
+    """Whether a distortion is beyond `DISTORTED`."""
+    return all(np.array([found.sigmas, found.share, found.rms_rad]) > DISTORTED)
 
 
 def _by_odometry(robot: RobotEvidence, times_ns: IntTable) -> Array:
