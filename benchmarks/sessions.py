@@ -53,7 +53,10 @@ FURNITURE = {
     "plant 2": (-1.0, 0.0),
 }
 #: messages that begin with a header
-STAMPED = (schemas.LASER_SCAN, schemas.ODOMETRY, schemas.JOINT_STATE, schemas.TRUE_POSE)
+STAMPED = (
+    schemas.LASER_SCAN, schemas.ODOMETRY, schemas.JOINT_STATE, schemas.SIGHTING, schemas.TRUE_POSE,
+    schemas.TRUE_LANDMARK,
+)  # fmt: skip
 #: m, m, rad: what the first day's start is known to. With 10 mrad all days would be 0.3 m off
 #: together at the other end of the building, and NEES would be that of a single draw
 START_SIGMA = (0.002, 0.002, 0.0002)

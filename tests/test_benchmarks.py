@@ -42,6 +42,7 @@ SMALL: dict[str, list[str]] = {
     "outlier_closures.py": [],
     "perturbed_logs.py": ["aces:half"],
     "prior_map.py": ["repeated", "--seeds", "1"],
+    "moved_posts.py": ["--seeds", "1", "--moves", "2"],
     "pushed_furniture.py": ["--seeds", "1", "--push", "0.05"],
     "reading_speed.py": ["--folder", "FOLDER"],
     "real_logs.py": ["aces"],

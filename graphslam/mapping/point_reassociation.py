@@ -17,6 +17,7 @@ from graphslam.core.arrays import IntArray
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array
 from graphslam.core.observation_models import MODELS
+from graphslam.core.record import replace
 from graphslam.core.records import Association, Estimate, Step
 from graphslam.mapping.gating import assign
 from graphslam.mapping.landmark_map import observed_from
@@ -211,3 +212,17 @@ def _nearest(seen: PointSightings, now: IntArray, near: IntArray, d2: Array) -> 
         for row, col in assign(cost, np.full_like(cost, FITS_NONE), "optimal"):
             best[own[row]] = points[col]
     return np.asarray(best)
+
+
+def retargeted(steps: Sequence[Step], targets: Mapping[int | None, int | str]) -> tuple[Step, ...]:
+    """Steps whose sightings are of other landmarks; ``targets`` by `Association.source`."""
+    return tuple(
+        replace(
+            step,
+            associations=tuple(
+                replace(a, target=targets[a.source]) if a.source in targets else a
+                for a in step.associations
+            ),
+        )
+        for step in steps
+    )

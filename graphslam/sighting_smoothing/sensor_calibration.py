@@ -157,7 +157,7 @@ def solved_with_sensors(
     Raises:
         EstimationError: the estimate is indeterminate.
     """
-    before = _Before.of(one)
+    before = PassSettings.of(one)
     solution = solve(start)
     sensors, told = Sensors.behind(one.sources), one.sources
     prior = np.tile(prior_sigmas(one.config.odometry), len(sensors.names))
@@ -224,7 +224,7 @@ def prior_sigmas(config: OdometryConfig) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Before:
+class PassSettings:
     """What a solution changes in its pass and another one is to begin with."""
 
     tracks: Mapping[str, tuple[OdometryConfig, Calibration]]
@@ -232,7 +232,7 @@ class _Before:
     dropped: Counter[str]
 
     @classmethod
-    def of(cls, one: LogPass) -> "_Before":
+    def of(cls, one: LogPass) -> "PassSettings":
         """Of a pass before it is solved."""
         tracks = {name: (run.track.config, run.track.prior) for name, run in one.started.items()}
         return cls(tracks, one.kernel, Counter(one.dropped))

@@ -19,6 +19,7 @@ from graphslam.mapping.robot_candidates import NOT_THERE
 from graphslam.mapping.robot_gating import RobotOffers
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.preintegration import Track
+from graphslam.sighting_smoothing.matched_sessions import with_sessions_matched
 from graphslam.sighting_smoothing.reoptimise_sightings import (
     group_sightings,
     recompute_steps,
@@ -115,6 +116,8 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
     Raises:
         EstimationError: the estimate is indeterminate.
     """
+    rough = with_sessions_matched(one, rough) or rough
+    one.keep_steps(one.steps)
 
     def solve(start: Estimate) -> FineSolution:
         noise = noise_of_pass(one, start)

@@ -144,6 +144,10 @@ class SightingProblem:
         for name, own in times.items():
             one.runs[name].times = own.tolist()
         one.counts["keyframes"] = sum(map(len, times.values()))
+        return self.solved_finely(steps, start)
+
+    def solved_finely(self, steps: Sequence[Step], start: Estimate) -> FineSolution:
+        """`solve` to the end, with what was solved."""
         last = LastSolution()
         found = self._solved(steps, start, rough=False, solved_once=last)
         return last.fine(*found, self.noise.shared_errors)

@@ -77,7 +77,11 @@ class SteppedProblem:
         return with_own_noise(made, self.noise), at_states(estimate, made, self.tracks)
 
     def finish(self, _one: LogPass, steps: Sequence[Step], start: Estimate) -> FineSolution:
-        """`solve`."""
+        """`solved_finely`."""
+        return self.solved_finely(steps, start)
+
+    def solved_finely(self, steps: Sequence[Step], start: Estimate) -> FineSolution:
+        """`solve`, with what was solved."""
         last = LastSolution()
         return last.fine(*self._solved(steps, start, last), self.noise.shared_errors)
 

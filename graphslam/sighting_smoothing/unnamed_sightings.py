@@ -5,16 +5,18 @@ twice. Solved as a whole, with the noise that the log shows, the states are accu
 which landmarks are one, and which of them each sighting is of.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from graphslam.core.records import Estimate, Step
 from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
-from graphslam.mapping.point_reassociation import PointSightings, is_point, reassociated
+from graphslam.mapping.point_reassociation import PointSightings, is_point, reassociated, retargeted
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.sighting_smoothing.false_points import find_false_points
+from graphslam.sighting_smoothing.matched_sessions import with_sessions_matched
 from graphslam.sighting_smoothing.misplaced_landmarks import with_landmarks_placed_again
 from graphslam.sighting_smoothing.sensor_calibration import solved_with_sensors
 from graphslam.sighting_smoothing.sighting_noise import noise_of_pass
@@ -44,11 +46,16 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
         return estimate, tuple(one.steps)
     before = len(estimate.landmarks)
     estimate = with_landmarks_placed_again(one.steps, estimate, config.robust)
+    matched = with_sessions_matched(one, estimate, partial(_associated_apart, one))
+    estimate = matched or estimate
 
     def solve(start: Estimate) -> FineSolution:
         noise = noise_of_pass(one, start)
         problem, start = sighting_problem(one, start, noise)
-        steps, start = _settled_associations(one, problem, start)
+        steps = problem.steps
+        if matched is None:  # else each session has been associated by itself
+            points = _unnamed_points(landmarks, start)
+            steps, start = _settled_associations(one, problem, steps, start, [points])
         targets = {a.source: a.target for step in steps for a in step.associations}
         false = _false_points(one, problem, steps, start)
         if false:
@@ -57,7 +64,7 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
             left = {i: found for i, found in start.landmarks.items() if i not in false}
             start = replace(start, landmarks=left)
         found = problem.finish(one, steps, start)
-        one.steps = list(_without_points(_retargeted(one.steps, targets), false))
+        one.steps = list(_without_points(retargeted(one.steps, targets), false))
         return found
 
     found = solved_with_sensors(one, estimate, solve)
@@ -75,16 +82,35 @@ def _unnamed_points(landmarks: LandmarkMap, estimate: Estimate) -> set[int]:
     return {i for i, one in entries.items() if one.identity is None and one.kind == "point"}
 
 
-def _settled_associations(
-    one: LogPass, problem: SightingProblem | SteppedProblem, estimate: Estimate
+def _associated_apart(
+    one: LogPass,
+    problem: SightingProblem | SteppedProblem,
+    steps: tuple[Step, ...],
+    estimate: Estimate,
+    sessions: Sequence[set[int]],
 ) -> tuple[tuple[Step, ...], Estimate]:
-    """The steps of a problem with every sighting at the point that it fits, and their estimate."""
-    points, steps = _unnamed_points(one.landmarks, estimate), problem.steps
-    if not points:
+    """`_settled_associations` with the points that each session sees."""
+    unnamed = _unnamed_points(one.landmarks, estimate)
+    groups = [points & unnamed for points in sessions]
+    return _settled_associations(one, problem, steps, estimate, groups)
+
+
+def _settled_associations(
+    one: LogPass,
+    problem: SightingProblem | SteppedProblem,
+    steps: tuple[Step, ...],
+    estimate: Estimate,
+    groups: Sequence[Collection[int]],
+) -> tuple[tuple[Step, ...], Estimate]:
+    """Steps with every sighting at the point of its group that it fits, and their estimate."""
+    if not any(groups):
         return steps, estimate
     for _ in range(MAX_ROUNDS):
         estimate, _ = problem.solve(steps, estimate, rough=True)
-        steps, estimate, moved, count = _associated_again(problem, steps, estimate, points)
+        moved = count = 0
+        for points in groups:
+            steps, estimate, again, of = _associated_again(problem, steps, estimate, points)
+            moved, count = moved + again, count + of
         one.counts["observations_reassociated"] += moved
         if moved <= SETTLED_SHARE * count:
             break
@@ -102,15 +128,15 @@ def _associated_again(
     Also how many sightings have moved, and of how many.
     """
     fine, there = problem.at_sightings(steps, estimate)
-    points = points & estimate.landmarks.keys()
+    points = {*points} & estimate.landmarks.keys()
     seen = PointSightings.of(fine, there, points)
     if not len(seen.target):
         return steps, estimate, 0, 0
     found = reassociated(seen, {i: estimate.landmarks[i][0] for i in points})
     sources = [a.source for step in fine for a in step.associations if is_point(a, points)]
     targets = dict(zip(sources, found.tolist(), strict=True))
-    steps = _retargeted(steps, targets)
-    placed = mean_landmarks(_retargeted(fine, targets), there.states)
+    steps = retargeted(steps, targets)
+    placed = mean_landmarks(retargeted(fine, targets), there.states)
     kept = {i: placed.get(i, found) for i, found in estimate.landmarks.items()}
     kept = {i: found for i, found in kept.items() if i in placed or i not in points}
     moved = int(np.count_nonzero(found != seen.target))
@@ -139,20 +165,6 @@ def _without_points(steps: Sequence[Step], points: Collection[int]) -> tuple[Ste
     """Steps without the sightings of some points."""
     return tuple(
         replace(step, associations=tuple(a for a in step.associations if not is_point(a, points)))
-        for step in steps
-    )
-
-
-def _retargeted(steps: Sequence[Step], targets: Mapping[int | None, int | str]) -> tuple[Step, ...]:
-    """Steps whose sightings are of other landmarks; ``targets`` by `Association.source`."""
-    return tuple(
-        replace(
-            step,
-            associations=tuple(
-                replace(a, target=targets[a.source]) if a.source in targets else a
-                for a in step.associations
-            ),
-        )
         for step in steps
     )
 
