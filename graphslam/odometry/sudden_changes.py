@@ -75,7 +75,7 @@ class SuddenChanges:
                 if len(inside) > MOST_SCANS:
                     inside = inside[np.linspace(0, len(inside) - 1, MOST_SCANS).astype(np.int64)]
                 some = undistorted_by_track([others[n] for n in inside.tolist()], self._track)
-                found = clouds | {
+                found = dict(clouds) | {
                     s.time_ns: scan_points(s, self._config.front_end.max_range_m) for s in some
                 }
                 own = [begin, *(s.time_ns for s in some), end]

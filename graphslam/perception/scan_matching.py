@@ -150,7 +150,7 @@ def make_submap(
 
 
 def make_group(poses: Array, clouds: Sequence[Array], config: ScanMatchingConfig) -> ScanGroup:
-    """As `make_submap`, in a tenth of the time."""
+    """As `make_submap`: points (n, 2) m alone, in a tenth of the time."""
     points = np.concatenate([transform(p, c) for p, c in zip(poses, clouds, strict=True)])
     cell = np.round(points / config.cell_m).astype(np.int64)
     _, kept = np.unique((cell[:, 0] << 32) + cell[:, 1], return_index=True)

@@ -59,7 +59,8 @@ class RobotState:
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
     many of ``motions`` the scans contradicted; ``lost``: times of consecutive scans that have
     nothing in common, see `ComparedScans`; ``changes``: where they suddenly have less;
-    ``resumed_ns``: of scans that came after a pause of the laser. ``repeats``: scans that are reported and not used.
+    ``resumed_ns``: of scans that came after a pause of the laser. ``repeats``: scans that are
+    reported and not used.
     Times are of the common clock, stamps of the robot's own ``clock``.
     """
 

@@ -25,8 +25,8 @@ class ComparedScans:
     """What was found of the scans of a block.
 
     ``pairs``: those that can be compared. ``lost``: times, ns, of the scans of pairs that have
-    little in common where odometry puts them, and that match nowhere else. ``shares``: times, ns, of
-    the scans of each pair -> the share of points of the later one on the earlier one.
+    little in common where odometry puts them, and that match nowhere else. ``shares``: times,
+    ns, of the scans of each pair -> the share of points of the later one on the earlier one.
     """
 
     pairs: Sequence[ScanPair] = ()

@@ -1,4 +1,4 @@
-"""Robots that are set down elsewhere while scans and odometry go on, and what only looks like it."""
+"""Robots that are set down elsewhere while scans and odometry go on, and what looks like it."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from walls import cast, rectangles
 from graphslam.core.config_io import load_config
 from graphslam.core.geometry import compose
 from graphslam.logs import LogWriter, open_logs
-from graphslam.odometry.sudden_changes import MOST_PLACES, SuddenChanges
 from graphslam.slam.smooth import smooth
 
 #: a hall with pillars, and a corridor with niches beside it
@@ -21,17 +20,17 @@ STEPS, EVENT = 140, 70
 HALL, CORRIDOR = np.array([2.0, 4.0, 0.0]), np.array([4.0, 11.0, 0.0])
 
 
-def is_set_down(k, pose, ranges):
+def is_set_down(k, pose):
     return (compose(CORRIDOR, [0.05 * (k - EVENT), 0.0, 0.0]) if k >= EVENT else pose), None
 
 
-def is_blocked(k, pose, ranges):
-    """Somebody stands in front of half of the beams for 2 s."""
-    near = np.where(np.abs(BEAMS) < 0.7, 0.6, np.inf)
-    return pose, near if EVENT <= k < EVENT + 20 else None
+def is_blocked(k, pose):
+    """Somebody walks in front of most of the beams for 3 s."""
+    near = np.where(np.abs(BEAMS) < 1.3, 0.5, np.inf)
+    return pose, near if EVENT <= k < EVENT + 30 else None
 
 
-def is_left_alone(k, pose, ranges):
+def is_left_alone(k, pose):
     return pose, None
 
 
@@ -42,7 +41,7 @@ def log_of(path, happens):
         log.mount("robot", START_NS, MOUNT)
         for k in range(STEPS):
             stamp = START_NS + k * S // 10
-            pose, near = happens(k, compose(HALL, [0.05 * k, 0.0, 0.0]), None)
+            pose, near = happens(k, compose(HALL, [0.05 * k, 0.0, 0.0]))
             odometry = compose(odometry, np.array([0.05 * (k > 0), 0, 0]) + rng.normal(0, 1e-4, 3))
             log.odometry("robot", stamp, odometry)
             if k % 2 == 0:
