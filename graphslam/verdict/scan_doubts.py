@@ -25,9 +25,9 @@ CURVED = 0.15
 DISTORTED = 10.0, 0.1, 0.005
 #: share of what the scans before and after a time can tell of each other that they deny; share of
 #: the points of either side that the other one saw through; and what they deny of any two of them.
-#: All three are more where a robot is set down elsewhere. Of healthy logs up to 0.1, 0.1 and 0.02,
-#: and 0.05 in aces where people pass; where people stand in front of the laser for up to 3 s the
-#: last is up to 0.02. Corridors that look alike have 0.12, 0.03 and 0.07
+#: All three are more where a robot is set down elsewhere. The first is up to 0.06 in Intel, and 0.3
+#: and more where somebody stands in front of the laser for 3 s: then the last is up to 0.02, if the
+#: map is right. Corridors that look alike have 0.12, 0.03 and 0.07
 DENIED, SEEN_THROUGH, LEAST_DENIED = 0.12, 0.02, 0.05
 #: ns without a scan, and usual times between two, in which a robot may be carried
 UNSEEN_NS, UNSEEN_SCANS = 1_000_000_000, 3
