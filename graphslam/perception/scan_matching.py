@@ -65,26 +65,17 @@ DUPLICATE_SHARE, DUPLICATE_RAD = 2 / 3, np.radians(6.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Submap:
+class ScanGroup:
     """What neighbouring scans saw, in one frame.
 
-    ``points`` (n, 2) m; ``information`` (n, 2, 2), 1/m^2, of each point about another one near it:
-    across a surface, in both directions where there is none, and zero where there are too few
-    neighbours to tell (where a wall leaves the laser's range); ``poses`` (k, 3) of the sensor and
-    ``clouds``, k arrays (n, 2) of the points in its frame.
+    ``points`` (n, 2) m; ``poses`` (k, 3) of the sensor and ``clouds``, k arrays (n, 2) of the
+    points in its frame.
     """
 
     points: Array
-    information: Array
     poses: Array
     clouds: Sequence[Array]
-    tree: cKDTree
     config: ScanMatchingConfig
-
-    @cached_property
-    def nearest(self) -> NearestPoints:
-        """The nearest point of each place."""
-        return NearestPoints.of(self.points, NEAREST_CELL * self.config.cell_m, self.config.reach_m)
 
     # computed on demand: few single scans are ever compared with another one beam by beam
     @cached_property
@@ -113,6 +104,24 @@ class Submap:
         return np.asarray(np.nan_to_num(self.images.min(axis=0))) - self.config.free_margin_m
 
 
+@dataclass(frozen=True, eq=False)
+class Submap(ScanGroup):
+    """A group of scans that others can be laid on.
+
+    ``information`` (n, 2, 2), 1/m^2, of each point about another one near it: across a surface, in
+    both directions where there is none, and zero where there are too few neighbours to tell (where
+    a wall leaves the laser's range).
+    """
+
+    information: Array
+    tree: cKDTree
+
+    @cached_property
+    def nearest(self) -> NearestPoints:
+        """The nearest point of each place."""
+        return NearestPoints.of(self.points, NEAREST_CELL * self.config.cell_m, self.config.reach_m)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
     """Pose (3,) of one submap in the frame of another, cov (3, 3) along that frame's axes.
@@ -134,14 +143,18 @@ def make_submap(
 
     ``clouds`` are k arrays (n, 2) of points in the sensor's frame, m.
     """
-    config = config or ScanMatchingConfig()
+    group = make_group(poses, clouds, config or ScanMatchingConfig())
+    tree = cKDTree(group.points)
+    information = _information(group.points, tree, group.config)
+    return Submap(group.points, group.poses, clouds, group.config, information, tree)
+
+
+def make_group(poses: Array, clouds: Sequence[Array], config: ScanMatchingConfig) -> ScanGroup:
+    """As `make_submap`: points (n, 2) m alone, in a tenth of the time."""
     points = np.concatenate([transform(p, c) for p, c in zip(poses, clouds, strict=True)])
     cell = np.round(points / config.cell_m).astype(np.int64)
     _, kept = np.unique((cell[:, 0] << 32) + cell[:, 1], return_index=True)
-    points = points[np.sort(kept)]
-    tree = cKDTree(points)
-    information = _information(points, tree, config)
-    return Submap(points, information, np.asarray(poses), clouds, tree, config)
+    return ScanGroup(points[np.sort(kept)], np.asarray(poses), clouds, config)
 
 
 def beam_of(x: Array, y: Array) -> IntArray:
@@ -369,7 +382,7 @@ def agreement(source: Submap, target: Submap, pose: Array) -> tuple[float, float
     return same / total, absent / total
 
 
-def compare_with_scans(points: Array, submap: Submap) -> tuple[BoolArray, BoolArray]:
+def compare_with_scans(points: Array, submap: ScanGroup) -> tuple[BoolArray, BoolArray]:
     """Which points (n, 2) any scan of the submap confirms, and which lie in its free space.
 
     In single precision, which is finer than 0.01 mm and a thousandth of a degree.

@@ -57,6 +57,7 @@ _CLASSES = (
     ("odometry.online_noise", "NoiseEvidence"),
     ("odometry.preintegration", "Track"),
     ("odometry.several_lasers", "SeveralLasersTrack"),
+    ("odometry.sudden_changes", "SuddenChange"),
     ("pipeline.log_pass", "PriorKnowledge"),
 )
 #: of a pass: what is given to it, or works only while the log is read; all else is kept

@@ -29,6 +29,7 @@ from graphslam.odometry.online_calibration import Calibrator, to_summary
 from graphslam.odometry.preintegration import Track
 from graphslam.odometry.reading_gaps import moved_in_gaps
 from graphslam.odometry.readings import EDGE_NS
+from graphslam.odometry.sudden_changes import SuddenChange
 from graphslam.perception.scan_matching import Submap
 from graphslam.pipeline.repeated_scans import RepeatedScans
 from graphslam.pipeline.scans_between import ScansBetween
@@ -57,8 +58,9 @@ class RobotState:
     calibrated mount puts it. ``is_calibrated``: the track's calibration was estimated together with
     all states. ``scan``: time and submap of the latest state that has a scan; ``contradicted``: how
     many of ``motions`` the scans contradicted; ``lost``: times of consecutive scans that have
-    nothing in common, see `ComparedScans`; ``resumed_ns``: of scans that came after a pause of the
-    laser. ``repeats``: scans that are reported and not used.
+    nothing in common, see `ComparedScans`; ``changes``: where they suddenly have less;
+    ``resumed_ns``: of scans that came after a pause of the laser. ``repeats``: scans that are
+    reported and not used.
     Times are of the common clock, stamps of the robot's own ``clock``.
     """
 
@@ -77,6 +79,7 @@ class RobotState:
     motions: int = 0
     contradicted: int = 0
     lost: list[tuple[int, int]] = field(default_factory=list)
+    changes: list[SuddenChange] = field(default_factory=list)
     clock: Clock = field(default_factory=Clock)
     repeats: RepeatedScans = field(default_factory=RepeatedScans)
     between: ScansBetween = field(default_factory=ScansBetween)

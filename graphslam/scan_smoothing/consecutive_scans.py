@@ -1,7 +1,7 @@
 """Each scan of a robot's first laser compared with the one before, where odometry puts it."""
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,11 +25,13 @@ class ComparedScans:
     """What was found of the scans of a block.
 
     ``pairs``: those that can be compared. ``lost``: times, ns, of the scans of pairs that have
-    little in common where odometry puts them, and that match nowhere else.
+    little in common where odometry puts them, and that match nowhere else. ``shares``: times,
+    ns, of the scans of each pair -> the share of points of the later one on the earlier one.
     """
 
     pairs: Sequence[ScanPair] = ()
     lost: Sequence[Span] = ()
+    shares: Mapping[Span, float] = field(default_factory=dict)
 
 
 class ConsecutiveScans:
@@ -79,7 +81,16 @@ class ConsecutiveScans:
         return ComparedScans(
             [replace(pair, suspect=one) for (_, pair), (one, _) in zip(pairs, found, strict=True)],
             self._lost(pairs, [overlap for _, overlap in found], clouds),
+            {
+                (pair.motion.start_ns, pair.motion.end_ns): share
+                for (_, pair), (_, share) in zip(pairs, found, strict=True)
+            },
         )
+
+    @property
+    def last(self) -> tuple[int, Array]:
+        """Time, ns (-1: none), and returns (k, 2) of the last scan of the blocks before."""
+        return self._last
 
     def end_block(self, scans: Sequence[Scan], points: Sequence[Array]) -> None:
         """The next block begins after the last of the scans; ``points`` (k, 2) as in `compare`."""

@@ -29,11 +29,9 @@ from graphslam.odometry.laser_odometry import with_laser_odometry
 from graphslam.odometry.noise_estimation import is_stated
 from graphslam.odometry.online_calibration import Learnt
 from graphslam.odometry.online_noise import noisier
-from graphslam.odometry.scan_odometry import (
-    MIN_POINTS,
-    suspect_motions,
-)
+from graphslam.odometry.scan_odometry import MIN_POINTS, suspect_motions
 from graphslam.odometry.several_lasers import SeveralLasersTrack
+from graphslam.odometry.sudden_changes import SuddenChanges
 from graphslam.odometry.sweep_motion import undistorted_by_track
 from graphslam.perception.dynamic_objects import dynamic_returns_of_all
 from graphslam.perception.front_ends import observe_block
@@ -182,6 +180,7 @@ class _Reader:
         self._state_ns: int | None = None
         self._state_of = ""  # the laser whose state is the last one
         self._consecutive = ConsecutiveScans(self.run.track, config.scan_matching)
+        self._changes = SuddenChanges(self.run.track, config)
         #: of the first laser, since the last keyframe: the next one may show that they are needed
         self._held: list[Scan] = []
         self._counts: Counter[str] = Counter()
@@ -205,6 +204,7 @@ class _Reader:
     def read_log(self) -> ReadLog:
         """What is known in the end."""
         self._keep_between(list(self._held))
+        self.run.changes = self._changes.found()
         for laser in self._lasers.values():
             if laser.run is not self.run:
                 self.run.repeats.left_out += laser.run.repeats.left_out
@@ -283,6 +283,7 @@ class _Reader:
                 motions = self._motions([image.scan for image in images])
                 compared = self._compared(images, motions)
             self._count(images, compared)
+            self._note_changes(images, compared)
         return self._finished(images, motions, compared)
 
     def _observed(self, used: list[Scan], *, keep_moving: bool = False) -> list["_Image"]:
@@ -418,6 +419,12 @@ class _Reader:
         self._lasers[""].suspect += sum(pair.suspect for pair in compared.pairs)
         with timed(self._seconds, "scan matching"):
             self._compare_further([i.scan for i in images], [i.points for i in images])
+
+    def _note_changes(self, images: Sequence["_Image"], compared: ComparedScans) -> None:
+        last_ns, points = self._consecutive.last
+        clouds = {last_ns: points} | {i.scan.time_ns: i.points for i in images if not i.scan.sensor}
+        with timed(self._seconds, "scan matching"):
+            self._changes.add(compared.shares, clouds, self._held)
 
     def _compare_further(self, used: Sequence[Scan], points: Sequence[Array]) -> None:
         """Count the motions of the further lasers that their scans contradict."""

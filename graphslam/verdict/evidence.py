@@ -31,6 +31,7 @@ from graphslam.verdict.scan_distortion import (
     by_robot,
     scan_distortion,
 )
+from graphslam.verdict.set_down import SceneChange, scene_changes
 from graphslam.verdict.told_starts import ToldStart, told_starts
 
 IntTable = np.ndarray[tuple[int, int], np.dtype[np.int64]]
@@ -99,6 +100,7 @@ class RobotEvidence:
     another one there; ``bridged_sigma_m``: of its position where scans were all that told;
     ``missing``: what increments of its odometry leave out;
     ``lost_ns`` (l, 2): times of consecutive scans that have nothing in common, see `ComparedScans`;
+    ``changes``: how what it sees changes where scans suddenly have less in common;
     ``curved``: share of what it saw of walls, see `curved_share`; ``skew``: how its walls are
     turned within scans.
     """
@@ -122,6 +124,7 @@ class RobotEvidence:
     bridged_sigma_m: float = 0.0
     missing: MissingIncrements = field(default_factory=MissingIncrements)
     lost_ns: IntTable = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    changes: tuple[SceneChange, ...] = ()
     curved: float = 0.0
     distortion: ScanDistortion = UNDISTORTED
 
@@ -190,7 +193,7 @@ def gather(
         motions = [(s.time_ns, s.motions[name].from_scans) for s in steps if name in s.motions]
         own = [a for step in steps for a in step.associations if a.robot == name]
         seen = [a for a in own if len(a.z) == 2]
-        result = robots[name]
+        result, kept = robots[name], scans.get(name, [])
         some = np.unique(np.linspace(0, len(result.final) - 1, MOST_POSES).astype(int))
         found.append(
             RobotEvidence(
@@ -213,8 +216,11 @@ def gather(
                 along_walls=along_walls[name],
                 bridged_sigma_m=run.track.bridged_sigma_m,
                 lost_ns=np.array(run.lost, dtype=np.int64).reshape(-1, 2),
+                changes=scene_changes(
+                    run.changes, kept, estimate.states[name], pipeline.config.scan_matching
+                ),
                 curved=curved_share(own),
-                distortion=scan_distortion(own, scans.get(name, []), estimate, run.track),
+                distortion=scan_distortion(own, kept, estimate, run.track),
             )
         )
     observed = _observed(steps)

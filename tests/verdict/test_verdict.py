@@ -16,6 +16,7 @@ from graphslam.pipeline.scan_evidence import Parked, _half_changed
 from graphslam.verdict.evidence import ClosureMisfits, Evidence, RobotEvidence, Seen
 from graphslam.verdict.moved_points import moved_doubts
 from graphslam.verdict.scan_distortion import Distortion, ScanDistortion
+from graphslam.verdict.set_down import SceneChange
 from graphslam.verdict.verdict import judge, with_truth
 
 S = 1_000_000_000
@@ -449,6 +450,23 @@ def test_a_laser_that_pauses_while_its_robot_stands_is_no_doubt():
     # nor are scans that have nothing in common without a pause
     lost = np.array([[196 * S, 199 * S]]) // 10
     assert reasons(evidence(scans=True, seen=no_sightings, lost_ns=lost)) == ("good", "")
+
+
+@pytest.mark.parametrize(
+    ("seen", "expected"),
+    [
+        ((0.3, 0.2, 0.1, 0.2), "doubtful"),
+        ((0.9, 0.04, 0.04, 0.2), "good"),  # a door that was opened
+        ((0.3, 0.2, 0.0, 0.2), "good"),  # who stood in front of the laser, for long, left
+        ((0.3, 0.2, 0.1, 0.02), "good"),  # somebody passed: scans agree again
+    ],
+)
+def test_a_robot_sees_another_place_where_scans_deny_each_other_and_never_agree_again(
+    seen, expected
+):
+    changes = (SceneChange(20 * S, 20 * S + S // 10, *seen),)
+    verdict, text = reasons(evidence(scans=True, seen=no_sightings, changes=changes))
+    assert verdict == expected and ("another place" in text) == (expected == "doubtful")
 
 
 def interrupted(*, counted):
