@@ -226,7 +226,7 @@ def _bound_by_joint(
 
 def _joint_of(result: Result | SavedResult) -> JointScans | None:
     if isinstance(result, SavedResult):
-        return result.joint
+        return result.joint if result.joint is not None and result.joint.ties else None
     return joint_scans(result.estimate, result.robots)
 
 

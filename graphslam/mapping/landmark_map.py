@@ -146,6 +146,7 @@ class LandmarkMap:
         """Take in landmarks with the numbers that they have."""
         self.entries |= entries
         self._tentative |= {n: e for n, e in entries.items() if not e.in_graph}
+        self.by_identity |= {e.identity: n for n, e in entries.items() if e.identity is not None}
         self.begin_at(1 + max(entries, default=-1))
         self.drop_index()
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, between, compose, exp, log, rotate_cov
 from graphslam.core.known_landmarks import KnownLandmarks
 from graphslam.core.record import replace
@@ -107,13 +108,14 @@ def _first(landmarks: Sequence[Landmark]) -> list[int]:
     return rows
 
 
-def _across(landmarks: Sequence[Landmark]) -> list[int]:
-    """Rows of errors across walls."""
-    return [
+def _across(landmarks: Sequence[Landmark]) -> IntArray:
+    """Rows (n,) of errors across walls."""
+    rows = [
         first + 1
         for first, mark in zip(_first(landmarks), landmarks, strict=True)
         if mark.kind != "point"
     ]
+    return np.array(rows, dtype=np.int64)
 
 
 def _off(mean: Array, mark: Landmark) -> Array:

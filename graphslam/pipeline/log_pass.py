@@ -37,7 +37,8 @@ class PriorKnowledge:
     ``frame_assignment``: start poses and frames of the robots. ``recorded``: which relative poses
     of the log are accepted. ``identities``: false identity -> right one, of what is sighted.
     ``clocks``: of robots whose clock is not that of the first. ``alone``: estimates of robots by
-    themselves, from which their relative poses were found. ``known_map``: of an earlier result.
+    themselves, from which their relative poses were found. ``known_map``: of an earlier result;
+    ``map_doubt``: of where the log was placed in it.
     ``calibrations``: robot -> that which an earlier pass found far from its prior.
     """
 
@@ -47,6 +48,7 @@ class PriorKnowledge:
     clocks: Mapping[str, Clock] = field(default_factory=dict)
     alone: Mapping[str, RobotEstimate] = field(default_factory=dict)
     known_map: KnownMap | None = None
+    map_doubt: str = ""
     calibrations: Mapping[str, Calibration] = field(default_factory=dict)
 
 
@@ -91,7 +93,7 @@ class LogPass:
         self.robot_sightings: list[Sighting] = []
         self.offers: dict[int, tuple[Association, ...]] = {}
         self.keyframe_scans: list[KeyframeScan] = []
-        self.map_doubt = ""  # of where it was placed in a known map
+        self.map_doubt = known.map_doubt  # of where it was placed in a known map
         self.parked: Mapping[str, Sequence[Parked]] | None = None
         #: landmarks that were moved: number -> the landmark that they were before
         self.moved: Mapping[int, int] = {}

@@ -30,7 +30,7 @@ from graphslam.results.file_formats import (
     to_json,
     tum_text,
 )
-from graphslam.results.joint_file import joint_bytes, joint_scans, read_joint
+from graphslam.results.joint_file import joint_bytes, joint_landmarks, read_joint
 from graphslam.results.scans_file import SCANS_FILE, place_scans, scans_bytes
 from graphslam.results.target_folder import check_target, is_result, write_folder
 
@@ -105,7 +105,7 @@ def _files(
     robots = list(result.robots.items())
     for own in parallel_map(trajectory_files, robots, efforts=poses, unit_ms=POSE_MS):
         yield from own
-    joint = joint_scans(result.estimate, result.robots)
+    joint = joint_landmarks(result.estimate, result.robots)
     if joint is not None:
         yield JOINT_FILE, joint_bytes(joint)
     scans = place_scans(result.keyframe_scans, result.estimate.states)

@@ -30,13 +30,24 @@ _UPPER = np.triu_indices(3)
 
 
 def joint_scans(estimate: Estimate, robots: Mapping[str, RobotResult]) -> JointScans | None:
-    """Of a result; None without a root, or if no scan follows from the final states."""
+    """Of a result; None without a root, or if no scan follows from the final states.
+
+    Of logs of sightings there are no scans, see `joint_landmarks`.
+    """
     ties = {name: own.scan_ties for name, own in robots.items() if own.scan_ties is not None}
     if estimate.root is None or not ties:
         return None
     states = {name: estimate.states[name] for name in ties}
     mounts = estimate.mounts and replace(estimate.mounts, states={})
     return JointScans(estimate.root, states, ties, mounts)
+
+
+def joint_landmarks(estimate: Estimate, robots: Mapping[str, RobotResult]) -> JointScans | None:
+    """`joint_scans`, or that of landmarks alone; None if neither is known."""
+    found = joint_scans(estimate, robots)
+    if found is not None or estimate.root is None or estimate.root.states:
+        return found
+    return JointScans(estimate.root, {}, {})
 
 
 def joint_bytes(joint: JointScans) -> bytes:

@@ -34,7 +34,7 @@ from graphslam.mapping.map_update import (
 from graphslam.mapping.submaps import SubmapPose, build_submaps
 from graphslam.results.file_formats import landmark_from_json, landmark_json, read_json
 from graphslam.results.folder import SavedResult, check_one_frame, load
-from graphslam.results.joint_file import UNREADABLE, joint_scans
+from graphslam.results.joint_file import UNREADABLE, joint_landmarks
 from graphslam.results.scans_file import SCANS_FILE, read_scans
 from graphslam.slam.summary import FORMAT as RESULT_FORMAT
 
@@ -70,8 +70,6 @@ def load_known_map(directory: Path, matching: ScanMatchingConfig | None = None) 
             f"{directory}: is of `graphslam follow`, which keeps no joint covariance of its "
             "landmarks; smooth the recording, and use that result as the map"
         )
-    if not (directory / SCANS_FILE).exists():
-        raise OutputError(f"{directory}: is of a log without scans; known maps are for scans")
     if saved.joint is None or not saved.joint.root.landmarks:
         raise OutputError(
             f"{directory}: has no joint covariance of its landmarks: it was made by an earlier "
@@ -130,7 +128,7 @@ def continued(result: Result, earlier: KnownMap) -> KnownMap:
     Raises:
         OutputError: the result has no joint covariance.
     """
-    joint = joint_scans(result.estimate, result.robots)
+    joint = joint_landmarks(result.estimate, result.robots)
     if joint is None:
         raise OutputError("known_map.update: the result has no joint covariance")
     bias_m = result.config.front_end.floor_normal_m
@@ -210,7 +208,9 @@ def known_on_a_day(
 
 
 def _submaps(directory: Path, saved: SavedResult, matching: ScanMatchingConfig) -> list[SubmapPose]:
-    """Submaps along the paths of a result."""
+    """Submaps along the paths of a result; none without scans."""
+    if not (directory / SCANS_FILE).exists():
+        return []
     placed = read_scans(directory / SCANS_FILE)
     states: dict[str, Trajectory] = {}
     for robot in sorted({scan.robot for scan in placed}):

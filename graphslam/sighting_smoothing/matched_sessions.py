@@ -1,9 +1,9 @@
 """Points sighted on several visits: which of them stand where they stood before.
 
-Between two sessions of one place posts are moved. A point that all sessions share has one place,
-and one that was moved drags the later paths, or its sightings pass for noise. So each session is
-solved by itself, with points of its own. Distances between these tell which points did not move, as
-for where a robot starts (`multi_robot.common_points`); only those are one in the map.
+Between two sessions of one place posts are moved, and since a known map was made. A point that all
+sessions share has one place, and one that was moved drags the later paths, or its sightings pass
+for noise. So each session is solved by itself, with points of its own. Distances between these tell
+which points did not move (`multi_robot.common_points`); only those are one in the map.
 """
 
 from collections import defaultdict
@@ -57,7 +57,7 @@ def with_sessions_matched(
         associate: associates sightings without names.
 
     Returns:
-        None if there is but one session, or they share no points.
+        None if there is but one session, and no known map, or they share no points.
 
     Raises:
         EstimationError: a session by itself is indeterminate.
@@ -82,9 +82,13 @@ def with_sessions_matched(
 
 
 def _sessions(one: LogPass) -> list[set[str]]:
-    """The robots of each session that is in the world, in the order of their times."""
+    """The robots of each session that is in the world, in the order of their times.
+
+    A known map is the first session, which no robot is in any more.
+    """
+    before: list[set[str]] = [] if one.known.known_map is None else [set()]
     if not one.given_config.logs.same_place:
-        return []
+        return [*before, {*one.started}] if before else []
     robots: dict[str, set[str]] = {}
     first: dict[str, int] = {}
     for name, run in one.started.items():
@@ -93,7 +97,7 @@ def _sessions(one: LogPass) -> list[set[str]]:
         recording = str(one.log.recordings_of(name)[0].path)
         robots.setdefault(recording, set()).add(name)
         first[recording] = min(first.get(recording, run.track.first_ns), run.track.first_ns)
-    return [robots[recording] for recording in sorted(robots, key=lambda name: first[name])]
+    return before + [robots[name] for name in sorted(robots, key=lambda name: first[name])]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,20 +120,28 @@ class _Split:
         targets: dict[int | None, int | str] = {}
         former: dict[int, int] = {}
         for number, by_session in seen.items():
-            for k in sorted(by_session)[1:]:
+            first = 0 if number in one.landmarks.known else 1  # the map has it already
+            for k in sorted(by_session)[first:]:
                 new = one.landmarks.next_number
                 one.landmarks.split(number, new)
                 if (name := logged_identity(one.landmarks.entries[number].identity)) is not None:
-                    one.landmarks.entries[new].identity = f"{min(sessions[k])}.{name}"
+                    one.landmarks.entries[new].identity = _later_name(one, name, sessions[k])
                 former[new] = number
                 targets |= {a.source: new for a in by_session[k]}
         if not former:
             return None
         steps = retargeted(one.steps, targets)
         placed = mean_landmarks(steps, estimate.states)
-        shared = {*former, *former.values()}
+        shared = {*former, *former.values()} & placed.keys()  # what only a map saw is there
         landmarks = {**marks, **{n: placed[n] for n in shared}}
         return cls(steps, replace(estimate, landmarks=landmarks), former)
+
+
+def _later_name(one: LogPass, name: str, session: set[str]) -> str:
+    """What a point is called that was moved before a session; in a map that goes on as it was."""
+    if one.known.known_map is not None and one.given_config.known_map.update:
+        return name
+    return f"{min(session)}.{name}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,7 +166,7 @@ def _solved_apart(
     Also what was solved, with a state at every sighting perhaps.
     """
     held = np.diag([HELD_M**2, HELD_M**2, HELD_RAD**2])
-    leaders = {min(robots) for robots in sessions}
+    leaders = {min(robots) for robots in sessions if robots}
 
     def at_start(robot: str, start: Start) -> Start:
         if robot not in leaders:
@@ -289,6 +301,7 @@ def _matched(
     """The sessions, one after another, laid on those before by the points that did not move."""
     points = _Points.of(one, solved, former)
     seen = [sorted(own & points.at.keys()) for own in _points_of(one.steps, sessions)]
+    seen[0] = sorted({*seen[0], *(one.landmarks.known.keys() & points.at.keys())})
     states, known = dict(apart.states), list(seen[0])
     into, moved, doubts = dict[int, int](), dict[int, int](), dict[str, str]()
     for robots, now in zip(sessions[1:], seen[1:], strict=True):
@@ -333,15 +346,18 @@ def _update_map(one: LogPass, split: _Split, found: _Matched) -> None:
         if isinstance(a.target, int) and a.model == "point":
             seen.setdefault(a.target, []).append(a)
     for number in [n for n in entries if n in split.estimate.landmarks and n not in seen]:
-        if entries[number].kind == "point":
+        if entries[number].kind == "point" and number not in one.landmarks.known:
             del entries[number]
     for number, own in seen.items():
         one.landmarks.recount(number, own)
         entry, robots = entries[number], {a.robot for a in own}
         entry.path_m = {r: far for r, far in entry.path_m.items() if r in robots}
     one.moved = {**one.moved, **found.moved}
-    one.counts["landmarks_moved"] += len(found.moved)
-    if found.doubts:
+    if found.moved:
+        one.counts["landmarks_moved"] += len(found.moved)
+    if found.doubts and one.known.known_map is not None:
+        one.map_doubt = "; ".join(filter(None, (one.map_doubt, TWO_PLACES)))
+    elif found.doubts:
         frames = one.known.frame_assignment
         doubted = replace(frames, remarks={**frames.remarks, **found.doubts})
         one.known = replace(one.known, frame_assignment=doubted)

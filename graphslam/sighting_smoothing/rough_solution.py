@@ -151,12 +151,19 @@ def with_landmarks(
     seen = [a for step in made for a in step.associations if isinstance(a.target, int)]
     x = observed_from(seen, estimate.states)
     number = np.array([a.target for a in seen])
-    landmarks = dict(known)
+    landmarks = {**_of_map(problem.steps), **known}
     for landmark in sorted(set(number.tolist()) - landmarks.keys()):
         own = np.flatnonzero(number == landmark)
         mean = seen_at([seen[k] for k in own], x[own])
         landmarks[landmark] = (mean, np.full((len(mean),) * 2, np.nan))
     return Estimate(states, landmarks, 0.0, 0), made
+
+
+def _of_map(steps: Sequence[Step]) -> Landmarks:
+    """Landmarks of a known map, where it has them."""
+    before = steps[0].known if steps else None
+    means = {} if before is None else before.means
+    return {n: (mean, np.full((len(mean),) * 2, np.nan)) for n, mean in means.items()}
 
 
 def _solved(problem: RoughProblem, states: Mapping[str, Trajectory], known: Landmarks) -> Estimate:

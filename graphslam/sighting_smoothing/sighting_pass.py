@@ -13,6 +13,7 @@ import numpy as np
 
 from graphslam.core.arrays import IntArray
 from graphslam.core.config import Config
+from graphslam.core.record import replace
 from graphslam.core.records import (
     Association,
     RelativePose,
@@ -61,6 +62,9 @@ class SightingPass(Pipeline):
         """Reads nothing yet."""
         super().__init__(log, config, known)
         self.all_named = True
+        if known.known_map is not None:
+            self.landmarks.add_known(known.known_map.entries(min(self.runs)))
+            self.landmarks.begin_at(known.known_map.next_number)
 
     def run(self, progress: Progress) -> None:
         """Read the log and make the steps; see `Pipeline`."""
@@ -82,6 +86,8 @@ class SightingPass(Pipeline):
                 self.steps.append(step)
         while starts:
             self._start(*starts.popleft())
+        if self.known.known_map is not None and self.steps:
+            self.steps[0] = replace(self.steps[0], known=self.known.known_map.known)
 
     def _read(self, progress: Progress) -> list[Sighting]:
         """All sightings that may be used; odometry goes into the tracks."""

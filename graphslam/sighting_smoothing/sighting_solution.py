@@ -19,6 +19,7 @@ from graphslam.mapping.robot_candidates import NOT_THERE
 from graphslam.mapping.robot_gating import RobotOffers
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.odometry.preintegration import Track
+from graphslam.sighting_smoothing.joint_landmarks import with_joint_landmarks
 from graphslam.sighting_smoothing.matched_sessions import with_sessions_matched
 from graphslam.sighting_smoothing.reoptimise_sightings import (
     group_sightings,
@@ -125,7 +126,7 @@ def solve_finely(one: SightingPass, rough: Estimate) -> tuple[Estimate, tuple[St
         return problem.finish(one, problem.steps, start)
 
     found = solved_with_sensors(one, rough, solve)
-    return found.estimate, found.steps
+    return with_joint_landmarks(found), found.steps
 
 
 def with_gated_robots(one: SightingPass, rough: Estimate, made: tuple[Step, ...]) -> Estimate:

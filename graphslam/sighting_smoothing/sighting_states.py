@@ -75,12 +75,13 @@ def steps_at_sightings(
                 seen[sighting.time_ns].append(replace(a, time_ns=sighting.time_ns, z=z, cov=cov))
     latest: dict[str, int] = {}
     begun: dict[str, int] = {}
-    made = []
+    made: list[Step] = []
+    known = steps[0].known if steps else None
     for time_ns in sorted({*starts, *seen, *ends}):
         if time_ns in starts:
             latest.update(dict.fromkeys(starts[time_ns], time_ns))
             begun.update(dict.fromkeys(starts[time_ns], time_ns))
-            made.append(Step(time_ns, dict(starts[time_ns])))
+            made.append(Step(time_ns, dict(starts[time_ns]), known=None if made else known))
         own = [a for a in seen.get(time_ns, []) if _robots(a) <= latest.keys()]
         dropped["sighting: no odometry near it"] += len(seen.get(time_ns, [])) - len(own)
         related = closures.get(time_ns, [])

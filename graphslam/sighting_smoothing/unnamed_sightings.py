@@ -16,6 +16,7 @@ from graphslam.mapping.landmark_map import LandmarkMap, mean_landmarks
 from graphslam.mapping.point_reassociation import PointSightings, is_point, reassociated, retargeted
 from graphslam.pipeline.log_pass import LogPass
 from graphslam.sighting_smoothing.false_points import find_false_points
+from graphslam.sighting_smoothing.joint_landmarks import with_joint_landmarks
 from graphslam.sighting_smoothing.matched_sessions import with_sessions_matched
 from graphslam.sighting_smoothing.misplaced_landmarks import with_landmarks_placed_again
 from graphslam.sighting_smoothing.sensor_calibration import solved_with_sensors
@@ -68,7 +69,7 @@ def solve_unnamed(one: LogPass, estimate: Estimate) -> tuple[Estimate, tuple[Ste
         return found
 
     found = solved_with_sensors(one, estimate, solve)
-    estimate, solved = found.estimate, found.steps
+    estimate, solved = with_joint_landmarks(found), found.steps
     gone = before - len(estimate.landmarks)
     one.counts["landmarks_merged"] += gone - one.counts["landmarks_removed"]
     landmarks.update_from(solved, estimate)

@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
+from graphslam.core.config import Config
 from graphslam.core.errors import LogError
 from graphslam.core.worker import Future
 from graphslam.estimation.clock_calibration import clocks_from_paths
 from graphslam.estimation.settled import settled
+from graphslam.logs import LogSet
 from graphslam.pipeline.findings import Findings, FinishedPass
 from graphslam.pipeline.log_pass import PriorKnowledge, timed
 from graphslam.pipeline.robot_state import Causal
@@ -28,6 +30,13 @@ from graphslam.slam.passes import decide_next_pass, find_clocks, find_swapped_na
 PATH_CLOCK_MS, CLOCK_MS = 0.05, 0.09
 
 
+def solves_at_once(log: LogSet, config: Config) -> bool:
+    """Whether a log may be solved as a whole, if all that is sighted has a name."""
+    settings = config.backend
+    whole = settings.name == "batch" and settings.reoptimise and settings.optimise_at_end
+    return whole and can_solve_at_once(log, config)
+
+
 def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPass | None:
     """`run_passes` without an incremental estimate; None for logs that need one.
 
@@ -38,9 +47,7 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
         EstimationError: the estimate is indeterminate, or a robot's start is unknown.
     """
     log, config = job.log, job.config
-    settings = config.backend
-    whole = settings.name == "batch" and settings.reoptimise and settings.optimise_at_end
-    if not (whole and can_solve_at_once(log, config)):
+    if not solves_at_once(log, config):
         return None
     clock_passes = 0
     while True:
@@ -52,17 +59,18 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
             path = log.files[0].path
             raise LogError(f"{path}: nothing in it could be used; see `graphslam info`")
         _ = one.groups  # once for both processes
+        in_map = known.known_map is not None
         replayed = Future(partial(replay_causally, one), urgent=False)  # waited for at the end
         with timed(one.seconds, "final optimisation"):
             rough, made = solve_roughly(one)
-            if is_misfit(rough) and not known.identities:
+            if is_misfit(rough) and not known.identities and not in_map:
                 # some sightings may be of something else
                 swapped = find_swapped_names(one, solve_without_contradiction(one))
                 if swapped:
                     replayed.cancel()
                     known = with_identities(known, log, config, swapped)
                     continue
-            if is_misfit(rough) and len(one.tracks) == 1:
+            if is_misfit(rough) and len(one.tracks) == 1 and not in_map:
                 # or odometry drifts too far for the rough solution, also for one that grows: with
                 # every step added by itself the estimate mostly keeps near its minimum
                 replayed.cancel()
@@ -87,7 +95,7 @@ def run_sighting_passes(job: SmoothingJob, known: PriorKnowledge) -> FinishedPas
             clocks_asked = Future(
                 partial(find_clocks, one, estimate, coarsely=False), about_ms=CLOCK_MS * len(seen)
             )
-            swapped = find_swapped_names(one, estimate)
+            swapped = {} if in_map else find_swapped_names(one, estimate)
             estimate = settled(one.steps, estimate, one.kernel)
             found = clocks_asked.result()
         following = decide_next_pass(known, Findings(swapped, found, {}), log, config, clock_passes)

@@ -13,7 +13,7 @@ from graphslam.mapping.loop_closure import Tamper
 from graphslam.pipeline.checkpoint import NOTHING_KEPT, Checkpoint
 from graphslam.pipeline.findings import FinishedPass
 from graphslam.pipeline.log_kind import is_scan_log, is_session_log
-from graphslam.pipeline.log_pass import Progress
+from graphslam.pipeline.log_pass import PriorKnowledge, Progress
 from graphslam.pipeline.robot_settings import check_robots
 from graphslam.pipeline.smoothing_job import SmoothingJob
 from graphslam.scan_smoothing.log_reader import Reading
@@ -22,7 +22,8 @@ from graphslam.slam.final_result import make_result
 from graphslam.slam.initialisation import initialise
 from graphslam.slam.passes import run_passes
 from graphslam.slam.pose_graph import is_pose_graph, solve_pose_graph
-from graphslam.slam.sighting_passes import run_sighting_passes
+from graphslam.slam.sighting_passes import run_sighting_passes, solves_at_once
+from graphslam.slam.starts_in_map import starts_in_map
 
 
 def smooth(
@@ -53,11 +54,8 @@ def smooth(
     """
     began = time.perf_counter()
     check_robots(log, config)
-    if known_map is not None and not (is_scan_log(log, config) and not config.backend.causal):
-        raise ConfigError(
-            "known_map.directory: only scans of one robot, by back end batch and without --causal, "
-            "are localised in a known map"
-        )
+    if known_map is not None:
+        _check_localisable(log, config, known_map)
     job = SmoothingJob(log, config, progress, tamper, kept)
     try:
         result = kept.stage("result", partial(_solved, job, known_map, ahead, began))
@@ -67,6 +65,28 @@ def smooth(
         raise
     summary = {**result.summary, "resumed": kept.resumed}
     return replace(result, summary=summary)
+
+
+def _check_localisable(log: LogSet, config: Config, known_map: KnownMap) -> None:
+    """Raise a ConfigError if logs like this one are not localised in a map like this one."""
+    is_of_scans = is_scan_log(log, config)
+    is_batch = solves_at_once(log, config)
+    if config.backend.causal or not (is_of_scans or is_batch):
+        raise ConfigError(
+            "known_map.directory: only scans of one robot, or sightings with names, by back end "
+            "batch and without --causal, are localised in a known map"
+        )
+    if is_of_scans and not known_map.places:
+        raise ConfigError(
+            f"known_map.directory: the map {known_map.name} is of a log without scans, in which "
+            "scans are not localised"
+        )
+
+
+def _starts(log: LogSet, config: Config, known_map: KnownMap | None) -> PriorKnowledge:
+    if known_map is not None and not is_scan_log(log, config):
+        return starts_in_map(log, config, known_map)
+    return initialise(log, config)
 
 
 def _solved(
@@ -81,7 +101,7 @@ def _solved(
         from graphslam.scan_smoothing.session_log import solve_session_log  # noqa: PLC0415
 
         return make_result(solve_session_log(job), began)
-    known = job.kept.stage("starts", lambda: initialise(log, config))
+    known = job.kept.stage("starts", partial(_starts, log, config, known_map))
     known = replace(known, known_map=known_map)
     initialised = time.perf_counter()
     if is_scan_log(log, config):

@@ -1,0 +1,159 @@
+"""Where robots that sight named points begin in a known map.
+
+The map is to them what another robot is whose frame is the world: points of one name are one, and
+those whose distances agree tell where a robot's own map lies in it
+(`multi_robot.relative_frames`). Robots that see few of its points are placed by the others.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from graphslam.core.config import BackendConfig, Config
+from graphslam.core.errors import EstimationError, LogError
+from graphslam.core.frame_forest import PRIOR_INFLATION
+from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
+from graphslam.core.geometry import Array, between, moved_by_world, wrap
+from graphslam.core.record import replace
+from graphslam.core.records import Start, Trajectory
+from graphslam.core.suggestions import start_option
+from graphslam.logs import LogSet
+from graphslam.mapping.known_map import MAP_ROBOT, KnownMap
+from graphslam.multi_robot.common_points import LEAST_COMMON
+from graphslam.multi_robot.frame_tree import FrameAssignment, build_frame_tree
+from graphslam.multi_robot.relative_frames import RobotEstimate
+from graphslam.pipeline.log_pass import PriorKnowledge
+from graphslam.pipeline.recorded_closures import RecordedClosures
+from graphslam.pipeline.start_priors import origin, start_poses
+from graphslam.sighting_smoothing.sighting_pass import SightingPass
+from graphslam.sighting_smoothing.sighting_solution import solve_robots_apart
+from graphslam.slam.initialisation import separate_estimates
+
+#: chi-square of three degrees of freedom at 99.9 %
+START_GATE = float(chi2_quantile(0.999, 3))
+#: the world of a log in a map: the map is certain where it is
+_HERE = Start(np.zeros(3), np.zeros((3, 3)))
+#: where nothing tells, though a start was told
+NOT_RECOGNISED = "nothing in it is recognised; the log is where its start was told to be"
+
+
+def starts_in_map(log: LogSet, config: Config, known_map: KnownMap) -> PriorKnowledge:
+    """The starts of all robots of a log of named sightings in a map.
+
+    Where both are known, the start that the map tells is used: a start that was told some
+    decimetres off would move the map. If it contradicts that, `PriorKnowledge.map_doubt` says so.
+
+    Raises:
+        LogError: some of what is sighted has no name.
+        EstimationError: a start is neither told nor found, or points of the map's names lie
+            otherwise than there.
+    """
+    own = origin(config)
+    names = set(log.robots)
+    nowhere = RecordedClosures({}, dict.fromkeys(names, ""), frozenset(), {})
+    apart = PriorKnowledge(FrameAssignment.separate_frames(names, own), nowhere)
+    together = SightingPass(log, replace(config, backend=BackendConfig()), apart)
+    together.run(lambda _count: None)
+    if not together.all_named:
+        raise LogError(
+            f"{log.files[0].path}: has sightings without names, which are not localised in a known "
+            "map"
+        )
+    views = separate_estimates(together, solve_robots_apart(together)) if together.steps else {}
+    tree = build_frame_tree(
+        [*log.robots, MAP_ROBOT],
+        {**views, MAP_ROBOT: _as_robot(known_map, views)} if views else {},
+        together.unrelated_sightings,
+        {MAP_ROBOT: _HERE},
+        config,
+        own,
+    )
+    told = _told(log, config)
+    starts, doubts = dict[str, Start](), []
+    for robot in log.robots:
+        is_found = tree.frames[robot] == MAP_ROBOT
+        shared = len(views[robot].landmarks.keys() & _names(known_map)) if robot in views else 0
+        if not is_found and (robot not in told or shared >= LEAST_COMMON):
+            why = f"it shares {shared} names of points with it"
+            if shared >= LEAST_COMMON:
+                why += ", which lie otherwise there"
+            raise EstimationError(
+                f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; "
+                f"give another map, or {start_option(robot)} (m, rad)"
+            )
+        start = tree.starts[robot] if is_found else told[robot]
+        starts[robot] = _in_world(start, known_map.known.pose_covariance())
+        if robot in told:
+            cov = tree.found[robot].cov if is_found else None
+            doubts.append(_doubt(told[robot], start.pose, cov))
+    world = min(log.robots)
+    frames = FrameAssignment(
+        starts, dict.fromkeys(log.robots, world), world,
+        {robot: one for robot, one in tree.found.items() if robot in starts},
+    )  # fmt: skip
+    said = "; ".join(dict.fromkeys(filter(None, doubts)))
+    recorded = RecordedClosures({}, frames.frames, frozenset(), {})
+    return PriorKnowledge(frames, recorded, alone=views, map_doubt=said)
+
+
+def _names(known_map: KnownMap) -> set[str]:
+    """Of its points."""
+    points = (mark for mark in known_map.landmarks if mark.kind == "point")
+    return {mark.identity for mark in points if mark.identity is not None}
+
+
+def _told(log: LogSet, config: Config) -> dict[str, Start]:
+    """The starts that somebody told; nobody is at the origin of a map by default."""
+    if not (config.start.poses or config.start.from_truth):
+        return {}
+    return start_poses(log, config)
+
+
+def _as_robot(known_map: KnownMap, views: Mapping[str, RobotEstimate]) -> RobotEstimate:
+    """The map as what a robot knows, which has never moved; odometry it has none of its own.
+
+    Where the map lies in the world is hardly known, perhaps. Its points have the covariances of
+    where they are in the map: without what is a motion of all of them.
+    """
+    named = [m for m in known_map.landmarks if m.identity is not None and m.kind == "point"]
+    numbers = [mark.id for mark in named]
+    cov = known_map.known.covariance(numbers) if numbers else np.zeros((0, 0))
+    at = np.array([mark.position[:2] for mark in named]).reshape(-1, 2)
+    off = at - at.mean(axis=0) if len(at) else at
+    turned = np.column_stack([-off[:, 1], off[:, 0]]).reshape(-1, 1)
+    moved = np.concatenate([np.tile(np.eye(2), (len(at), 1)), turned], axis=1)
+    in_map = np.eye(len(cov)) - moved @ np.linalg.pinv(moved)
+    cov = in_map @ cov @ in_map.T
+    marks = {
+        str(mark.identity): (place, cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])
+        for k, (mark, place) in enumerate(zip(named, at, strict=True))
+    }
+    nowhere = Trajectory(np.zeros(1, dtype=np.int64), np.zeros((1, 3)), np.zeros((1, 3, 3)))
+    return RobotEstimate(nowhere, next(iter(views.values())).track, marks)
+
+
+def _in_world(start: Start, map_cov: Array) -> Start:
+    """A start relative to a map, whose place in the world is known to ``map_cov`` (3, 3).
+
+    It must not tell that again: see `scan_smoothing.localisation.in_world`.
+    """
+    J = PRIOR_INFLATION * moved_by_world(start.pose)
+    return replace(start, world_cov=start.cov + J @ map_cov @ J.T)
+
+
+def _doubt(told: Start, found: Array, found_cov: Array | None) -> str:
+    """What is to be said of a start that was told, where the map has it elsewhere, or not at all.
+
+    ``found`` (3,), with ``found_cov`` (3, 3); None if it was not found.
+    """
+    if found_cov is None:
+        return NOT_RECOGNISED
+    off = found - told.pose
+    off[2] = wrap(off[2])
+    if mahalanobis_squared(off, told.cov + found_cov) <= START_GATE:
+        return ""
+    apart = between(told.pose, found)
+    return (
+        f"the start that was told is {np.hypot(apart[0], apart[1]):.2f} m and "
+        f"{np.degrees(abs(apart[2])):.1f}° from where the map has it, and was not used"
+    )
