@@ -37,7 +37,8 @@ class FrameAssignment:
     ``world`` is the frame of the world. ``found``: robot -> the relation by which it was placed,
     with the covariance of all that it hangs on. ``undecided``: robot -> why it has a separate frame
     although it shares observations with others. ``remarks``: robot -> what is to be known about
-    where it was placed.
+    where it was placed. ``better``: robot whose start was told -> base pose (3,) in its frame at
+    which it would begin if it were where its log fits a map clearly better.
     """
 
     starts: Mapping[str, Start]
@@ -46,6 +47,7 @@ class FrameAssignment:
     found: Mapping[str, RelativeFrame] = field(default_factory=dict)
     undecided: Mapping[str, str] = field(default_factory=dict)
     remarks: Mapping[str, str] = field(default_factory=dict)
+    better: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
     def one_frame(cls, starts: Mapping[str, Start]) -> "FrameAssignment":
@@ -75,6 +77,13 @@ class FrameAssignment:
                 "evidence": relation.weight,
             }
         return summary
+
+    def better_to_summary(self) -> dict[str, dict[str, float]]:
+        """For summary.json: robot -> the start at which it would fit clearly better."""
+        return {
+            robot: dict(zip(("x", "y", "phi"), pose.tolist(), strict=True))
+            for robot, pose in sorted(self.better.items())
+        }
 
 
 def build_frame_tree(

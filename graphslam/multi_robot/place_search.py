@@ -92,6 +92,7 @@ def alternative_alignments(
     places_a: Sequence[SubmapPose],
     places_b: Sequence[SubmapPose],
     config: MultiRobotConfig,
+    apart_m: float = DISTINCT_M,
 ) -> list[Array]:
     """Distinct starts (3,) at which all places together fit the map nearly as well as at ``start``.
 
@@ -102,6 +103,7 @@ def alternative_alignments(
         places_a: places of a, in its frame.
         places_b: places of b, in its frame; those where a was not, by ``start``, are left out.
         config: settings.
+        apart_m: m, between starts that are distinct though they are turned alike.
     """
     positions = np.array([p.pose[:2] for p in places_a])
     shared = [p for p in places_b if nearest_of_each_pass(positions, compose(start, p.pose))]
@@ -112,7 +114,7 @@ def alternative_alignments(
     spectrum = map_spectrum(places_a, float(np.hypot(*points.T).max()), config)
     own = compose(start, middle)
     x, y = (spectrum.low[k] + cell_m * np.arange(spectrum.shape[k]) for k in (0, 1))
-    close = (x[:, None] - own[0]) ** 2 + (y - own[1]) ** 2 < DISTINCT_M**2
+    close = (x[:, None] - own[0]) ** 2 + (y - own[1]) ** 2 < apart_m**2
     at_start, best_of_turn = 0.0, []
     for turn in np.arange(0.0, 2 * np.pi, STEP_RAD):
         heading = own[2] + turn
@@ -127,6 +129,6 @@ def alternative_alignments(
         if score <= ALTERNATIVE_SHARE * at_start or len(found) == MAX_POSES:
             break
         off = [between(other, pose) for other in found]
-        if all(np.hypot(d[0], d[1]) > DISTINCT_M or abs(d[2]) > DISTINCT_RAD for d in off):
+        if all(np.hypot(d[0], d[1]) > apart_m or abs(d[2]) > DISTINCT_RAD for d in off):
             found.append(pose)
     return [compose(pose, inverse(middle)) for pose in found]

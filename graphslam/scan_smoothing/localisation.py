@@ -29,6 +29,7 @@ from graphslam.core.suggestions import start_option
 from graphslam.mapping.known_map import KnownMap
 from graphslam.mapping.loop_closure import Tamper
 from graphslam.mapping.submaps import SubmapPose, submaps_at, with_poses_from
+from graphslam.multi_robot.better_starts import better_alignment
 from graphslam.multi_robot.hypothesis_choice import best_explanation, contradiction, doubt
 from graphslam.multi_robot.map_localisation import Support, hypotheses, support
 from graphslam.multi_robot.place_recognition import PlaceMap, seen_extent
@@ -39,6 +40,8 @@ from graphslam.scan_smoothing.scan_tracking import ScanLog, TrackedLog
 
 #: chi-square of three degrees of freedom at 99.9 %
 START_GATE = float(chi2_quantile(0.999, 3))
+#: m², m², rad²: of a start that was found on a grid of cells
+CELL_COV = np.diag([0.3, 0.3, 0.05]) ** 2
 
 
 def localise(scan_log: ScanLog, known_map: KnownMap, tamper: Tamper | None = None) -> ClosedPaths:
@@ -86,8 +89,8 @@ def start_as_given(
     Which of the places that look alike it is, the given one says. Where exactly, the map does, as
     for a start that is found: in the estimate a start that is told some decimetres off would rather
     move the whole map, which is hardly known in the world. If the map contradicts it by more than
-    what both are known to, that is a doubt. Only where no place of the map is recognised the start
-    is as given.
+    what both are known to, that is a doubt, and so it is if the path fits clearly better somewhere
+    else. Only where no place of the map is recognised the start is as given.
 
     Raises:
         EstimationError: from there the log sees something else than the map.
@@ -108,6 +111,13 @@ def start_as_given(
     if not placed.confirmed.any():
         said = "no place of it is recognised; the log is where its start was told to be"
     scan_log.map_doubt = said
+    better = better_alignment(known_map.places, places, placed, scan_log.config.multi_robot)
+    if better is not None:
+        pose = compose(better, laid.states[robot].poses[0])
+        there = close_path_in_map(scan_log, robot, Start(pose, CELL_COV), known_map, tamper)
+        base = compose(there.states[robot].poses[0], inverse(scan_log.runs[robot].track.mount))
+        assignment = replace(scan_log.known.frame_assignment, better={robot: base})
+        scan_log.known = replace(scan_log.known, frame_assignment=assignment)
     if not placed.confirmed.any():
         return given, laid
     return in_world(start_of_closed_path(laid, robot), known_map.known.pose_covariance()), laid

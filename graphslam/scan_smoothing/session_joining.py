@@ -33,6 +33,7 @@ from graphslam.core.records import Start
 from graphslam.logs import LogSet
 from graphslam.mapping.known_map import KnownMap, latest_places
 from graphslam.mapping.submaps import SubmapPose, with_poses_from
+from graphslam.multi_robot.better_starts import better_alignment
 from graphslam.multi_robot.frame_tree import FrameAssignment
 from graphslam.multi_robot.hypothesis_choice import (
     Refusal,
@@ -47,6 +48,7 @@ from graphslam.multi_robot.place_search import DISTINCT_M, DISTINCT_RAD
 from graphslam.multi_robot.relative_frames import RelativeFrame
 from graphslam.pipeline.start_priors import origin, start_poses
 from graphslam.scan_smoothing.localisation import (
+    CELL_COV,
     close_path_in_map,
     in_world,
     own_places,
@@ -81,7 +83,11 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
     tracked = {name: _Session.of(sessions[name], name) for name in by_time}
     given = {name: _of_first_state(sessions, name, world, told) for name in told}
     placed = {name: start for name, start in given.items() if name in sessions}
-    doubted = _check_given(placed, tracked)
+    doubted, elsewhere = _check_given(placed, tracked, config)
+    better = {
+        name: _of_base(pose, sessions[name], name, told[name], given[name])
+        for name, pose in elsewhere.items()
+    }
     groups = [_group(placed, tracked)]
     groups += [_group({n: origin(config)}, tracked) for n in by_time if n not in given]
     refused = merge(groups, tracked, config)
@@ -98,7 +104,7 @@ def join_sessions(log: LogSet, sessions: Mapping[str, ScanLog], config: Config) 
             pose = between(starts[leader].pose, start.pose)
             found[name] = RelativeFrame(name, leader, pose, cov, group.confirmed[name])
     undecided = {name: why for name, why in refused.items() if frames[name] == name != world}
-    return FrameAssignment(starts, frames, world, found, undecided, remarks)
+    return FrameAssignment(starts, frames, world, found, undecided, remarks, better)
 
 
 def _as_priors(starts: Mapping[str, Start], given: Collection[str]) -> dict[str, Start]:
@@ -114,19 +120,27 @@ def _as_priors(starts: Mapping[str, Start], given: Collection[str]) -> dict[str,
     }
 
 
-def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"]) -> dict[str, str]:
-    """See that sessions whose starts are told agree with those before them; doubts of some.
+def _check_given(
+    given: Mapping[str, Start], sessions: Mapping[str, "_Session"], config: Config
+) -> tuple[dict[str, str], dict[str, Array]]:
+    """See that sessions whose starts are told agree with those before them.
+
+    Returns:
+        Doubts of some; and of those that fit clearly better elsewhere, the pose (3,) of their first
+        state there.
 
     Raises:
         EstimationError: from there one sees something else than the others.
     """
     before: dict[str, Start] = {}
     doubted: dict[str, str] = {}
+    better: dict[str, Array] = {}
     for name, start in given.items():
         group = _group(before, sessions)
         if group.map.places:
             session = sessions[name]
-            placed = group.lay({name: start}, sessions).support
+            laid = group.lay({name: start}, sessions)
+            placed = laid.support
             why = contradiction(placed)
             if why:
                 raise EstimationError(
@@ -135,8 +149,23 @@ def _check_given(given: Mapping[str, Start], sessions: Mapping[str, "_Session"])
                 )
             if said := doubt(placed, session.own.places, session.log.config.loop_closure):
                 doubted[name] = said
+            places = group.map.places
+            motion = better_alignment(places, laid.places, placed, config.multi_robot)
+            if motion is not None:
+                there = Start(compose(motion, laid.starts[name].pose), CELL_COV)
+                better[name] = group.lay({name: there}, sessions).starts[name].pose
         before[name] = start
-    return doubted
+    return doubted, better
+
+
+def _of_base(pose: Array, session: ScanLog, name: str, told: Start, given: Start) -> Array:
+    """The base pose (3,) that is to be told for a session to begin at ``pose`` (3,), its sensor's.
+
+    ``told`` is that of the base, for which it begins at ``given``.
+    """
+    mount = session.runs[name].track.mount
+    to_told = compose(compose(told.pose, mount), inverse(given.pose))
+    return compose(compose(to_told, pose), inverse(mount))
 
 
 def _of_first_state(

@@ -122,6 +122,7 @@ def summarise(
         "world": known.frame_assignment.world,
         "frames": dict(sorted(known.frame_assignment.frames.items())),
         "starts_found": known.frame_assignment.to_summary(),
+        "starts_better": known.frame_assignment.better_to_summary(),
         **_sessions(pipeline),
         "rejected": dict(sorted(pipeline.rejected.items())),
         "dropped": dict(sorted(all_dropped.items())),

@@ -207,7 +207,14 @@ def _unplaced(evidence: Evidence) -> Iterable[Reason]:
 
 
 def _starts(evidence: Evidence) -> Iterable[Reason]:
-    """Starts that were told, but not where the robots saw that they are from each other."""
+    """Starts that were told, but not where robots saw that they are from a map or each other."""
+    for name, at in evidence.summary.get("starts_better", {}).items():
+        text = (
+            f"{name}: fits clearly better elsewhere than where its start was told: if it begins at "
+            f"{at['x']:.2f},{at['y']:.2f},{at['phi']:.3f}, all of its first places are confirmed "
+            "and less contradicts them; is the told start wrong?"
+        )
+        yield Reason("doubtful", "starts", name, text)
     found = contradictions(evidence.told)
     if not found:
         return

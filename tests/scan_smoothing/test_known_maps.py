@@ -143,6 +143,26 @@ def test_a_start_that_is_told_wrong_does_not_move_the_map(tmp_path, off_m, doubt
     assert (result.summary["verdict"]["verdict"] == "doubtful") == doubted
 
 
+def test_a_start_told_half_a_turn_wrong_is_doubted_and_the_right_one_named(tmp_path):
+    """In a room that a cupboard alone tells from itself turned: each place fits well enough."""
+    room = rectangles((0, 0, 10, 8), (4, 3.5, 6, 4.5), (0, 7, 1.3, 8))
+    log = drive(tmp_path / "first.mcap", room=room)
+    graphslam.smooth(log, output=tmp_path / "first", config=graphslam.load_config(**START))
+    log = drive(tmp_path / "later.mcap", room=room, phase=0.3, seed=3)
+    right = true_pose(0.0, 0.3)
+    turned = np.array([10.0, 8.0, np.pi]) - right * [1, 1, -1]
+    for told, is_doubted in ((right, False), (turned, True)):
+        found = localised(log, tmp_path / "first", **{"start.poses.robot": told.tolist()}).summary
+        assert ("robot" in found["starts_better"]) == is_doubted
+        verdict = found["verdict"]
+        assert (verdict["verdict"] == "doubtful") == is_doubted
+    better = found["starts_better"]["robot"]
+    np.testing.assert_allclose([better["x"], better["y"]], right[:2], atol=0.05)
+    assert abs(wrap(better["phi"] - right[2])) < 0.02
+    assert [reason["check"] for reason in verdict["reasons"]] == ["starts"]
+    assert f"begins at {better['x']:.2f}" in verdict["reasons"][0]["text"]
+
+
 def test_a_start_beside_the_map_is_a_doubt(tmp_path, first_day):
     """A sign mistaken. Nothing of the map is seen, so nothing contradicts it either."""
     log = drive(tmp_path / "later.mcap", room=FURNISHED, phase=0.3, seed=3)

@@ -12,7 +12,7 @@ from walls import rectangles
 import graphslam
 from graphslam.change_detection.visit import load_visit
 from graphslam.core.errors import EstimationError, OutputError
-from graphslam.core.geometry import between
+from graphslam.core.geometry import between, wrap
 from graphslam.core.records import Closure
 from graphslam.evaluation.metrics import evaluate
 from graphslam.evaluation.trajectory_metrics import pair_poses
@@ -60,6 +60,22 @@ def test_sessions_that_begin_anywhere_are_one_map(tmp_path):
     # four walls of the room, four of the box, and four of the furniture; a wall that each day
     # would have for itself makes three of it
     assert len(result.landmarks) < 20
+
+
+def test_a_session_told_half_a_turn_wrong_is_doubted_and_the_right_start_named(tmp_path):
+    """The room looks the same turned, but for a cupboard."""
+    days = sessions(tmp_path, *[rectangles(*BOX, (0, 7, 1.3, 8))] * 2)
+    first, right = (true_pose(0.0, 0.3 * n) for n in (0, 1))
+    turned = np.array([10.0, 8.0, np.pi]) - right * [1, 1, -1]
+    for told, is_doubted in ((right, False), (turned, True)):
+        poses = {"start.poses.day0": first.tolist(), "start.poses.day1": told.tolist()}
+        summary = graphslam.smooth(days, config=SAME_PLACE, **poses).summary
+        assert list(summary["starts_better"]) == ["day1"] * is_doubted
+        said = [r["about"] for r in summary["verdict"]["reasons"] if r["check"] == "starts"]
+        assert said == ["day1"] * is_doubted
+    better = summary["starts_better"]["day1"]
+    np.testing.assert_allclose([better["x"], better["y"]], right[:2], atol=0.1)
+    assert abs(wrap(better["phi"] - right[2])) < 0.02
 
 
 def test_where_the_first_session_is_in_the_world_no_other_tells(tmp_path):
