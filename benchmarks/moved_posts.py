@@ -22,6 +22,7 @@ from common import parser
 from sessions import DAY_S, SAME_PLACE, START_SIGMA, later
 
 import graphslam
+from graphslam.core.errors import EstimationError
 from graphslam.simulation import load_scenario, simulate
 
 #: where the posts stand, m
@@ -141,7 +142,10 @@ def run_in_map(moves: Mapping[str, tuple[float, float]], seed: int, *, told: boo
         start = {"poses": {"robot": first}, **STATED}
         graphslam.smooth(days[0], start=start, output=known["directory"])
         start = {"poses": {"robot": second} if told else {}, **STATED}
-        result = graphslam.smooth(days[1], start=start, known_map=known)
+        try:
+            result = graphslam.smooth(days[1], start=start, known_map=known)
+        except EstimationError:  # refused
+            return Run(False, False, np.nan, np.nan, False)
         found = graphslam.evaluate(result)["robots"]["robot"]["final"]
     names = sorted(mark.identity or "" for mark in result.landmarks)
     is_told_apart = names == sorted([*POSTS, *(f"robot.{post}" for post in moves)])

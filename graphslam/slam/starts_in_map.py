@@ -13,13 +13,13 @@ from graphslam.core.config import BackendConfig, Config
 from graphslam.core.errors import EstimationError, LogError
 from graphslam.core.frame_forest import PRIOR_INFLATION
 from graphslam.core.gaussian import chi2_quantile, mahalanobis_squared
-from graphslam.core.geometry import Array, between, moved_by_world, wrap
+from graphslam.core.geometry import Array, between, moved_by_world, transform, wrap
 from graphslam.core.record import replace
 from graphslam.core.records import Start, Trajectory
 from graphslam.core.suggestions import start_option
 from graphslam.logs import LogSet
 from graphslam.mapping.known_map import MAP_ROBOT, KnownMap
-from graphslam.multi_robot.common_points import LEAST_COMMON
+from graphslam.multi_robot.common_points import FLOOR_M, GATE, LEAST_COMMON
 from graphslam.multi_robot.frame_tree import FrameAssignment, build_frame_tree
 from graphslam.multi_robot.relative_frames import RobotEstimate
 from graphslam.pipeline.log_pass import PriorKnowledge
@@ -60,9 +60,10 @@ def starts_in_map(log: LogSet, config: Config, known_map: KnownMap) -> PriorKnow
             "map"
         )
     views = separate_estimates(together, solve_robots_apart(together)) if together.steps else {}
+    before = _as_robot(known_map, views) if views else None
     tree = build_frame_tree(
         [*log.robots, MAP_ROBOT],
-        {**views, MAP_ROBOT: _as_robot(known_map, views)} if views else {},
+        views if before is None else {**views, MAP_ROBOT: before},
         together.unrelated_sightings,
         {MAP_ROBOT: _HERE},
         config,
@@ -72,15 +73,8 @@ def starts_in_map(log: LogSet, config: Config, known_map: KnownMap) -> PriorKnow
     starts, doubts = dict[str, Start](), []
     for robot in log.robots:
         is_found = tree.frames[robot] == MAP_ROBOT
-        shared = len(views[robot].landmarks.keys() & _names(known_map)) if robot in views else 0
-        if not is_found and (robot not in told or shared >= LEAST_COMMON):
-            why = f"it shares {shared} names of points with it"
-            if shared >= LEAST_COMMON:
-                why += ", which lie otherwise there"
-            raise EstimationError(
-                f"robot {robot}: where it begins in the map {known_map.name} is not known: {why}; "
-                f"give another map, or {start_option(robot)} (m, rad)"
-            )
+        if not is_found:
+            _check_told(robot, told.get(robot), views.get(robot), before, known_map.name, tree)
         start = tree.starts[robot] if is_found else told[robot]
         starts[robot] = _in_world(start, known_map.known.pose_covariance())
         if robot in told:
@@ -96,10 +90,53 @@ def starts_in_map(log: LogSet, config: Config, known_map: KnownMap) -> PriorKnow
     return PriorKnowledge(frames, recorded, alone=views, map_doubt=said)
 
 
-def _names(known_map: KnownMap) -> set[str]:
-    """Of its points."""
-    points = (mark for mark in known_map.landmarks if mark.kind == "point")
-    return {mark.identity for mark in points if mark.identity is not None}
+def _check_told(
+    robot: str,
+    told: Start | None,
+    own: RobotEstimate | None,
+    before: RobotEstimate | None,
+    name: str,
+    tree: FrameAssignment,
+) -> None:
+    """Whether a start that was not found was told, and is not contradicted by the points there.
+
+    ``own`` is the robot's estimate in a frame of its own, ``before`` the map, of this ``name``.
+
+    Raises:
+        EstimationError: it was not, or is.
+    """
+    shared, there = 0, 0
+    if own is not None and before is not None:
+        both = sorted(own.landmarks.keys() & before.landmarks.keys())
+        shared = len(both)
+        if told is not None and both:
+            p, P, q, Q = (
+                np.array([one.landmarks[mark][k] for mark in both])
+                for one, k in ((before, 0), (before, 1), (own, 0), (own, 1))
+            )
+            J = _of_start(told.pose, q)
+            off = p - transform(told.pose, q)
+            spread = P + Q + J @ told.cov @ J.mT + FLOOR_M**2 * np.eye(2)
+            there = int((mahalanobis_squared(off, spread) <= GATE).sum())
+    if told is not None and (shared < LEAST_COMMON or 2 * there > shared):
+        return
+    why = tree.undecided.get(robot, "").replace(MAP_ROBOT, "the map")
+    why = why or f"it shares {shared} names of points with it"
+    if told is not None:
+        why += f"; of {shared} points {there} are where the start that was told has them"
+    raise EstimationError(
+        f"robot {robot}: where it begins in the map {name} is not known: {why}; give another map, "
+        f"or {start_option(robot)} (m, rad)"
+    )
+
+
+def _of_start(pose: Array, q: Array) -> Array:
+    """Derivatives (n, 2, 3) of points ``q`` (n, 2) of a robot in the world by its start (3,)."""
+    off = transform(pose, q) - pose[:2]
+    J = np.zeros((len(q), 2, 3))
+    J[:, :, :2] = np.eye(2)
+    J[:, 0, 2], J[:, 1, 2] = -off[:, 1], off[:, 0]
+    return J
 
 
 def _told(log: LogSet, config: Config) -> dict[str, Start]:
