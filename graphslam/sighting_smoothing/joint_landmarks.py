@@ -4,6 +4,8 @@ A known map is a joint Gaussian of landmarks. Of scans it follows from the root 
 sightings there may be a state at every one of them, so just that of the points is kept.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphslam.core.geometry import Array
@@ -19,22 +21,30 @@ MOST_POINTS = 400
 def with_joint_landmarks(found: FineSolution) -> Estimate:
     """The estimate of a solution, with the root of what is known of its points alone.
 
-    None is made of lines, and of more than `MOST_POINTS`. Where sightings share errors, or sensors
-    have some, points are known less well than the graph that was solved says. The joint covariance
-    is that of the graph, widened point by point.
+    None is made of lines, and of more than `MOST_POINTS`.
     """
     estimate = found.estimate
     numbers = sorted(estimate.landmarks)
-    covs = [estimate.landmarks[n][1] for n in numbers]
-    if not 0 < len(numbers) <= MOST_POINTS or any(len(cov) != 2 for cov in covs):
+    is_of_points = all(len(mean) == 2 for mean, _ in estimate.landmarks.values())
+    if not (is_of_points and 0 < len(numbers) <= MOST_POINTS):
         return estimate
-    cov = found.solved.joint(numbers).cov[3:, 3:]
+    return replace(estimate, root=_dense_root(joint_covariance(found, numbers), numbers))
+
+
+def joint_covariance(found: FineSolution, points: Sequence[int]) -> Array:
+    """Covariance (2n, 2n) m² of n points of a solution, along world axes.
+
+    Where sightings share errors, or sensors have some, points are known less well than the graph
+    that was solved says. So its covariance is widened point by point.
+    """
+    cov = found.solved.joint(points).cov[3:, 3:]
     wider = np.zeros_like(cov)
-    for k, own in enumerate(covs):
+    for k, point in enumerate(points):
         block = slice(2 * k, 2 * k + 2)
         half = np.linalg.cholesky(cov[block, block])
-        wider[block, block] = np.linalg.cholesky(own) @ np.linalg.inv(half)
-    return replace(estimate, root=_dense_root(wider @ cov @ wider.T, numbers))
+        own = np.linalg.cholesky(found.estimate.landmarks[point][1])
+        wider[block, block] = own @ np.linalg.inv(half)
+    return wider @ cov @ wider.T
 
 
 def _dense_root(cov: Array, numbers: list[int]) -> InformationRoot:

@@ -16,16 +16,16 @@ from scipy.spatial import cKDTree
 from graphslam.core.gaussian import mahalanobis_squared
 from graphslam.core.geometry import Array, compose, transform
 from graphslam.core.records import Association, Estimate, Start, Step, Trajectory
-from graphslam.estimation.calibration_graph import CalibratedSolution
 from graphslam.mapping.landmark_map import mean_landmarks
 from graphslam.mapping.point_reassociation import is_point, retargeted
 from graphslam.multi_robot.common_points import FLOOR_M, GATE, CommonPoints, common_points
 from graphslam.multi_robot.frames import logged_identity
 from graphslam.pipeline.log_pass import LogPass
+from graphslam.sighting_smoothing.joint_landmarks import joint_covariance
 from graphslam.sighting_smoothing.sensor_calibration import PassSettings
 from graphslam.sighting_smoothing.sighting_noise import noise_of_pass
 from graphslam.sighting_smoothing.sighting_states import at_states
-from graphslam.sighting_smoothing.state_at_every_sighting import SightingProblem
+from graphslam.sighting_smoothing.state_at_every_sighting import FineSolution, SightingProblem
 from graphslam.sighting_smoothing.state_per_step import SteppedProblem, sighting_problem
 
 #: m: points without names that are farther apart are not compared
@@ -57,18 +57,27 @@ def with_sessions_matched(
         associate: associates sightings without names.
 
     Returns:
-        None if there is but one session, and no known map, or they share no points.
+        None if there is but one session, and no known map, or they share no points, or all of
+        those that have names are where they were.
 
     Raises:
         EstimationError: a session by itself is indeterminate.
     """
-    sessions = _sessions(one)
+    sessions, before = _sessions(one), one.steps
+    calibrations = {name: run.track.calibration for name, run in one.started.items()}
     split = _Split.of(one, estimate, sessions)
     if split is None:
         return None
     starts = {robot: s for step in one.steps for robot, s in step.starts.items()}
     apart, solved = _solved_apart(one, split, sessions, associate)
     found = _matched(one, apart, solved, sessions, split.former)
+    if associate is None and all(found.into.get(n) == old for n, old in split.former.items()):
+        one.steps = before  # all are what they were taken for
+        for number in split.former:
+            del one.landmarks.entries[number]
+        for name, calibration in calibrations.items():
+            one.runs[name].track.calibration = calibration
+        return None
     one.steps = [
         replace(step, starts={robot: starts[robot] for robot in step.starts})
         for step in _merged(one.steps, found.into)
@@ -160,7 +169,7 @@ class _Matched:
 
 def _solved_apart(
     one: LogPass, split: _Split, sessions: Sequence[set[str]], associate: Associate | None
-) -> tuple[Estimate, CalibratedSolution]:
+) -> tuple[Estimate, FineSolution]:
     """The estimate of each session by itself, where it starts; the steps of the pass follow.
 
     Also what was solved, with a state at every sighting perhaps.
@@ -188,7 +197,7 @@ def _solved_apart(
     before.restore(one)
     one.sources = sources
     tracks = {name: run.track for name, run in one.started.items()}
-    return at_states(found.estimate, one.steps, tracks), found.solved
+    return at_states(found.estimate, one.steps, tracks), found
 
 
 def _points_of(steps: Sequence[Step], sessions: Sequence[set[str]]) -> list[set[int]]:
@@ -214,10 +223,10 @@ class _Points:
     at: dict[int, Array]
     origin: Mapping[int, int]
     named: frozenset[int]
-    solved: CalibratedSolution
+    solved: FineSolution
 
     @classmethod
-    def of(cls, one: LogPass, solved: CalibratedSolution, former: Mapping[int, int]) -> "_Points":
+    def of(cls, one: LogPass, solved: FineSolution, former: Mapping[int, int]) -> "_Points":
         """Those of a pass whose sessions were solved by themselves."""
         entries, marks = one.landmarks.entries, solved.estimate.landmarks
         at = {n: mean for n, (mean, _) in marks.items() if entries[n].kind == "point"}
@@ -255,7 +264,7 @@ class _Points:
         for k, pair in enumerate(compared):
             for n, sign in zip(pair, (1.0, -1.0), strict=True):
                 A[2 * k : 2 * k + 2, place[n] : place[n] + 2] = sign * np.eye(2)
-        cov = A @ self.solved.joint(numbers).cov[3:, 3:] @ A.T if numbers else np.zeros((0, 0))
+        cov = A @ joint_covariance(self.solved, numbers) @ A.T if numbers else np.zeros((0, 0))
         before, now = (self.stacked([pair[k] for pair in compared]) for k in (0, 1))
         found = common_points(before, now, cov)
         if found is None:
@@ -294,7 +303,7 @@ def _near(before: Array, now: Array) -> list[tuple[int, int]]:
 def _matched(
     one: LogPass,
     apart: Estimate,
-    solved: CalibratedSolution,
+    solved: FineSolution,
     sessions: Sequence[set[str]],
     former: Mapping[int, int],
 ) -> _Matched:
