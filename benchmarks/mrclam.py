@@ -2,13 +2,14 @@
 
 Imported, smoothed from the true start poses and evaluated by the commands that a user types; then
 without sightings of robots, both also by the filter, without identities, with two codes exchanged
-in the table of who bears which, with the start of one robot alone given, and every robot by itself,
-from its own messages. Errors are root mean squares over all robots at 10 Hz over the whole log,
+in the table of who bears which, with the start of one robot alone given, every robot by itself,
+from its own messages, and the second half of the set, by itself and, with no start given, in the
+map of the first half. Errors are root mean squares over all robots at 10 Hz over the whole log,
 stretches without sightings included; s and CPU s are those of the whole `smooth` command with its
 report.
 
 Run: python benchmarks/mrclam.py [NAME ...], of robots, alone, ekf, ekf-alone, unnamed, exchanged,
-start1 to start5, robot1 to robot5
+start1 to start5, robot1 to robot5, half, in-map
 """
 
 import tarfile
@@ -20,7 +21,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from graphslam.core.config import Config
-from graphslam.logs import open_logs
+from graphslam.logs import LogWriter, open_logs
 from graphslam.pipeline.start_priors import first_truth
 
 SOURCE = DATA / "mrclam/MRCLAM_Dataset6.tar.xz"
@@ -33,6 +34,8 @@ RUNS = {
     "exchanged": [],
     **{f"start{k}": [] for k in range(1, 6)},
     **{f"robot{k}": [] for k in range(1, 6)},
+    "half": [],
+    "in-map": [],
 }
 #: subjects of which the run `exchanged` has each bear the other's code
 EXCHANGED = ("2", "9")
@@ -75,6 +78,25 @@ def by_itself(log: Path, robot: str, target: Path) -> Path:
     return target
 
 
+def halves(log: Path, folder: Path) -> list[Path]:
+    """The first half of a log, and the second."""
+    with log.open("rb") as stream:
+        found = [
+            (channel.topic, schema.name, message.data, message.log_time)
+            for schema, channel, message in make_reader(stream).iter_messages()
+            if schema is not None
+        ]
+    times = [time_ns for *_, time_ns in found]
+    middle = (min(times) + max(times)) // 2
+    paths = [folder / "half0.mcap", folder / "half1.mcap"]
+    for k, path in enumerate(paths):
+        with LogWriter(path) as made:
+            for topic, schema, data, time_ns in found:
+                if (time_ns >= middle) == bool(k) or topic == "/true_landmarks":
+                    made.encoded(topic, schema, data, time_ns)
+    return paths
+
+
 def row(name: str, log: Path, folder: Path) -> str:
     """One line of the table."""
     start = "truth"
@@ -83,9 +105,14 @@ def row(name: str, log: Path, folder: Path) -> str:
         log_set = open_logs([log], Config())
         x, y, phi = first_truth(log_set)[robot]
         start = f"{robot}={x},{y},{phi}"
-    _, used = measured_command(
-        "smooth", str(log), "--start", start, "-o", str(folder / name), *RUNS[name]
-    )
+    options = ["--start", start, *RUNS[name]]
+    if name in ("half", "in-map"):
+        first, log = halves(log, folder)
+    if name == "in-map":
+        known = folder / "map"
+        command("smooth", str(first), "--start", "truth", "-o", str(known))
+        options = ["--prior-map", str(known)]
+    _, used = measured_command("smooth", str(log), "-o", str(folder / name), *options)
     found = command("evaluate", str(folder / name), "--truth", str(log))
     final, causal = found["joint"]["final"], found["joint"]["causal"]
     worst = max(robot["final"]["ate_rmse_m"] for robot in found["robots"].values())
