@@ -280,15 +280,16 @@ class _Points:
         same: Mapping[int, int],
     ) -> dict[int, int]:
         """`common` of the ``pairs`` that were not compared with each other."""
-        done, known = {n for _, n in compared}, {*same.values()}
+        done, taken = {n for _, n in compared}, {*same.values()}
         marks, found = self.solved.estimate.landmarks, dict[int, int]()
-        left = [(old, new) for old, new in pairs if new not in done and old not in known]
-        for old, new in left:
+        for old, new in pairs:
+            if new in done or new in found or old in taken:
+                continue
             off = self.at[old] - transform(pose, self.at[new])
             cov = marks[old][1] + marks[new][1] + FLOOR_M**2 * np.eye(2)
-            if new not in found and mahalanobis_squared(off, cov) <= GATE and old not in known:
+            if mahalanobis_squared(off, cov) <= GATE:
                 found[new] = old
-                known.add(old)
+                taken.add(old)
         return found
 
 
@@ -332,11 +333,12 @@ def _moved(points: _Points, before: Sequence[int], now: Sequence[int]) -> dict[i
     """Points ``now`` -> those ``before`` that they probably were: the nearest, each once."""
     pairs = points.candidates(before, now)
     apart = [float(np.hypot(*(points.at[new] - points.at[old]))) for old, new in pairs]
-    found: dict[int, int] = {}
+    found, taken = dict[int, int](), set[int]()
     for k in np.argsort(apart, kind="stable").tolist():
         old, new = pairs[k]
-        if new not in found and old not in found.values():
+        if new not in found and old not in taken:
             found[new] = old
+            taken.add(old)
     return found
 
 
