@@ -129,7 +129,9 @@ def test_a_map_of_another_place_is_refused_though_its_points_have_the_same_names
     log = recorded(tmp_path, "other", 4, begin=BEGIN, moved=moved)
     with pytest.raises(EstimationError, match="where it begins in the map map is not known"):
         localised(log, earlier)
-    with pytest.raises(EstimationError, match=r"of 7 points [01] are where the start that was told"):
+    with pytest.raises(
+        EstimationError, match=r"of 7 points [01] are where the start that was told"
+    ):
         localised(log, earlier, start={"poses": {"robot": list(BEGIN)}})
 
 
@@ -150,3 +152,17 @@ def test_what_is_not_localised_in_such_a_map_is_refused(earlier, tmp_path):
         localised(log, earlier)
     with pytest.raises(ConfigError, match="only scans of one robot, or sightings with names"):
         localised(log, earlier, backend={"name": "ekf"})
+
+
+def test_live_points_are_known_by_their_names(earlier, tmp_path):
+    """Without names some of the first, from a start told 0.3 m off, would be new points."""
+    log = recorded(tmp_path, "second", 4, begin=BEGIN)
+    told = [BEGIN[0] + 0.2, BEGIN[1] - 0.2, BEGIN[2]]
+    session = graphslam.Session(
+        known_map={"directory": str(earlier)},
+        start={"poses": {"robot": told}, "given_sigma_m": 0.3, "given_sigma_rad": 0.05},
+    )
+    for _ in session.process(graphslam.open_logs(log).messages()):
+        pass
+    assert session.known_map["observations_of_others"] == 0
+    assert session.known_map["seen"] == 7
