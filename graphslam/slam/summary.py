@@ -119,6 +119,7 @@ def summarise(
         "consolidated": {name: counts[name] for name in REOPTIMISED if name in counts},
         "closures": known.recorded.to_summary(),
         **known_map_summary(pipeline),
+        **_moved_points(pipeline, estimate),
         "world": known.frame_assignment.world,
         "frames": dict(sorted(known.frame_assignment.frames.items())),
         "starts_found": known.frame_assignment.to_summary(),
@@ -202,6 +203,22 @@ def known_map_summary(pipeline: LogPass) -> dict[str, Any]:
             "retired": [],
         }
     }
+
+
+def _moved_points(pipeline: LogPass, estimate: Estimate) -> dict[str, Any]:
+    """The key ``moved_points``, of sightings: points that stood elsewhere in an earlier session."""
+    marks, entries = estimate.landmarks, pipeline.landmarks.entries
+    found = [
+        {
+            "id": new,
+            "was": old,
+            "name": entries[old].identity,
+            "moved_m": float(np.hypot(*(marks[new][0] - marks[old][0])[:2])),
+        }
+        for new, old in sorted(pipeline.moved.items())
+        if {new, old} <= marks.keys() and entries[new].kind == "point"
+    ]
+    return {"moved_points": found} if found else {}
 
 
 def lasers_used(log: LogSet, robot: str, run: RobotState) -> list[dict[str, Any]]:

@@ -1,7 +1,8 @@
-"""Doubts about named points that are elsewhere later: moved, or two of them bear one name.
+"""Named points that are elsewhere later, within a log or since an earlier one.
 
 A robust kernel leaves the smaller part of their sightings out. The path stays right, where enough
-other points hold it, but the map has one place for the point, and nobody is told.
+other points hold it, but the map has one place for the point, and nobody is told. So it is doubted:
+the point was moved, or two bear its name. Of an earlier session or map both places are in the map.
 """
 
 from collections import defaultdict
@@ -12,13 +13,15 @@ import numpy as np
 
 from graphslam.core.arrays import IntArray
 from graphslam.core.geometry import Array, polar_points, transform_each
-from graphslam.verdict.doubts import MOVED_M, Reason, seconds
+from graphslam.verdict.doubts import MOVED_M, Fact, Reason, seconds
 from graphslam.verdict.evidence import Evidence, Seen
 
 #: sightings before and after, at least, and ns that they take: errors of the path last for a while
 LEAST, LEAST_NS = 5, 2_000_000_000
 #: how far apart the places are, in median distances of the sightings from their own place
 APART = 5.0
+#: points that a line names
+MOST_NAMED = 8
 
 
 def moved_doubts(evidence: Evidence) -> Iterator[Reason]:
@@ -39,6 +42,19 @@ def moved_doubts(evidence: Evidence) -> Iterator[Reason]:
             f"{first} on another, {found.distance_m:.2f} m away: it was moved, or two bear its name"
         )
         yield Reason("doubtful", "moved", name, text)
+
+
+def moved_facts(evidence: Evidence) -> Iterator[Fact]:
+    """Points that stand elsewhere than in an earlier session, or in the known map."""
+    moved = evidence.summary.get("moved_points", ())
+    if not moved:
+        return
+    what = [
+        f"{one['name'] or 'number ' + str(one['was'])} by {one['moved_m']:.2f} m" for one in moved
+    ]
+    more = f" and {len(what) - MOST_NAMED} more" if len(what) > MOST_NAMED else ""
+    text = f"moved since it was seen before: {', '.join(what[:MOST_NAMED])}{more}"
+    yield Fact("moved", "", None, text)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from graphslam.verdict.doubts import Reason, seconds
 from graphslam.verdict.evidence import Evidence
 from graphslam.verdict.excursions import excursion_doubts
 from graphslam.verdict.gross_errors import misplaced_doubts, without_harmless
-from graphslam.verdict.moved_points import moved_doubts
+from graphslam.verdict.moved_points import moved_doubts, moved_facts
 from graphslam.verdict.odometry_doubts import odometry_doubts
 from graphslam.verdict.regular_landmarks import regular_landmark_doubts
 from graphslam.verdict.scan_doubts import scan_doubts
@@ -56,7 +56,7 @@ def judge(evidence: Evidence) -> dict[str, Any]:
     """
     rest, errors = without_harmless(evidence)
     reasons = (reason for check in CHECKS.values() for reason in check(rest))
-    facts = (*errors, *scale_facts(evidence))
+    facts = (*errors, *scale_facts(evidence), *moved_facts(evidence))
     return to_summary(reasons, [asdict(fact) for fact in facts])
 
 

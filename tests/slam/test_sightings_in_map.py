@@ -114,6 +114,10 @@ def test_posts_that_were_moved_are_new_and_leave_a_map_that_goes_on(earlier, tmp
         log, known_map={"directory": str(earlier), "update": True}, output=tmp_path / "on"
     )
     assert names(continued) == [f"p{k}" for k in range(1, 8)]
+    found = {one["name"]: one["moved_m"] for one in continued.summary["moved_points"]}
+    assert found == pytest.approx({"p3": np.hypot(0.3, 0.2), "p5": np.hypot(0.2, 0.3)}, abs=0.05)
+    (fact,) = (one for one in continued.summary["verdict"]["facts"] if one["check"] == "moved")
+    assert fact["text"].startswith("moved since it was seen before: p3 by 0.3")
     retired = continued.summary["known_map"]["retired"]
     before = {m.id: m.identity for m in graphslam.load_result(earlier).landmarks}
     assert sorted(before[one["id"]] for one in retired) == ["p3", "p5"]
