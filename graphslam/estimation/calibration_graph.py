@@ -389,15 +389,17 @@ class CalibrationGraph:
             covs[robot][np.ix_(use, use)] = own
         return covs
 
-    def landmark_covariance(self, landmarks: Sequence[int]) -> Array:
+    def landmark_covariance(self, landmarks: Sequence[int], *, in_world: bool = False) -> Array:
         """Joint covariance (D, D) of landmarks at the last solution, along world axes.
+
+        ``in_world``: with what is not known of where in the world a known map lies.
 
         Raises:
             EstimationError: it is indeterminate.
         """
         keys = [factors.landmark_key(i) for i in landmarks]
         dims = [self._builder.landmark_dims[i] for i in landmarks]
-        own = self._joint_covariance(keys)
+        own = self._joint_covariance(keys, in_world=in_world)
         turn, ends = np.eye(len(own)), np.cumsum(dims)
         for key, dim, end in zip(keys, dims, ends, strict=True):
             if dim == 3:
@@ -405,9 +407,15 @@ class CalibrationGraph:
                 turn[block, block] = rotation3(factors.read(self._values, key, 3)[2])
         return np.asarray(turn @ own @ turn.T)
 
-    def _joint_covariance(self, keys: Sequence[int]) -> Array:
+    def _joint_covariance(self, keys: Sequence[int], *, in_world: bool = False) -> Array:
         """Joint covariance (D, D) of variables at the last solution, in their own axes."""
         try:
+            if in_world:
+                self._relinearise()
+                self._builder.place(in_world=True)
+                found = JointMarginals(self._builder.graph, self._values).of(keys)
+                self._builder.place(in_world=False)
+                return found
             if self._marginals is None:
                 self._relinearise()
                 self._marginals = JointMarginals(self._builder.graph, self._values)
@@ -424,9 +432,12 @@ class CalibratedSolution:
     calibrations: Mapping[str, Calibration]
     graph: CalibrationGraph
 
-    def joint(self, landmarks: Sequence[int]) -> JointMarginal:
-        """Joint marginal of landmarks; the pose in front of them is left out (zeros)."""
-        own = self.graph.landmark_covariance(landmarks)
+    def joint(self, landmarks: Sequence[int], *, in_world: bool = False) -> JointMarginal:
+        """Joint marginal of landmarks; the pose in front of them is left out (zeros).
+
+        ``in_world``: see `CalibrationGraph.landmark_covariance`.
+        """
+        own = self.graph.landmark_covariance(landmarks, in_world=in_world)
         means = [np.zeros(3), *(self.estimate.landmarks[i][0] for i in landmarks)]
         cov = np.zeros((3 + len(own), 3 + len(own)))
         cov[3:, 3:] = own

@@ -37,7 +37,7 @@ def joint_covariance(found: FineSolution, points: Sequence[int]) -> Array:
     Where sightings share errors, or sensors have some, points are known less well than the graph
     that was solved says. So its covariance is widened point by point.
     """
-    cov = found.solved.joint(points).cov[3:, 3:]
+    cov = found.solved.joint(points, in_world=True).cov[3:, 3:]
     wider = np.zeros_like(cov)
     for k, point in enumerate(points):
         block = slice(2 * k, 2 * k + 2)

@@ -170,3 +170,21 @@ def test_live_points_are_known_by_their_names(earlier, tmp_path):
         pass
     assert session.known_map["observations_of_others"] == 0
     assert session.known_map["seen"] == 7
+
+
+def test_a_map_that_goes_on_for_days_stays_as_well_known_as_it_is(earlier, tmp_path):
+    """By covariances in which the map is held where it is, sigmas shrink until they are none."""
+    moved, day = {}, earlier
+    for k, post in enumerate(("p3", "p5", "p2", "p6")):
+        moved = moved | {post: (0.2, -0.25)}
+        log = recorded(tmp_path, f"day{k}", 20 + k, begin=BEGIN if k % 2 else (3.0, 2.0, 0.1799),
+                       moved=moved)  # fmt: skip
+        result = graphslam.smooth(
+            log, known_map={"directory": str(day), "update": True}, output=tmp_path / f"map{k}"
+        )
+        assert [one["name"] for one in result.summary["moved_points"]] == [post]
+        day = tmp_path / f"map{k}"
+    found = graphslam.evaluate(result)
+    assert found["landmarks"]["rmse_m"] < 0.15
+    # of seven points, whose errors are mostly those of the first day: beyond 3.5 in one of 1000
+    assert found["landmarks"]["nees_per_dof"] < 3.5
