@@ -39,6 +39,10 @@ MOST_COMPARED = 200
 TWO_PLACES = (
     "nearly as many of the points that it shares with earlier sessions agree on another place"
 )
+BENT = (
+    "the points that it shares with earlier sessions lie otherwise there, by more than both are "
+    "known to: many were moved a little, or noise is more than it seems"
+)
 #: associates the sightings of each session again: problem, steps, their estimate, points by session
 Associate = Callable[
     [SightingProblem | SteppedProblem, tuple[Step, ...], Estimate, Sequence[set[int]]],
@@ -77,6 +81,7 @@ def with_sessions_matched(
             del one.landmarks.entries[number]
         for name, calibration in calibrations.items():
             one.runs[name].track.calibration = calibration
+        _note_doubts(one, found.doubts)
         return None
     one.steps = [
         replace(step, starts={robot: starts[robot] for robot in step.starts})
@@ -322,8 +327,8 @@ def _matched(
             points.at |= {n: transform(found.pose, points.at[n]) for n in now}
             gone, new = {*known} - {*same.values()}, {*now} - {*same}
             moved |= _moved(points, sorted(gone), sorted(new))
-            if found.is_open:
-                doubts |= dict.fromkeys(robots, TWO_PLACES)
+            if found.is_open or found.is_bent:
+                doubts |= dict.fromkeys(robots, TWO_PLACES if found.is_open else BENT)
         into |= same
         known += [n for n in now if n not in same]
     return _Matched(states, into, moved, doubts)
@@ -366,9 +371,14 @@ def _update_map(one: LogPass, split: _Split, found: _Matched) -> None:
     one.moved = {**one.moved, **found.moved}
     if found.moved:
         one.counts["landmarks_moved"] += len(found.moved)
-    if found.doubts and one.known.known_map is not None:
-        one.map_doubt = "; ".join(filter(None, (one.map_doubt, TWO_PLACES)))
-    elif found.doubts:
+    _note_doubts(one, found.doubts)
+
+
+def _note_doubts(one: LogPass, doubts: Mapping[str, str]) -> None:
+    """Have the verdict tell doubts, robot -> text, about where sessions lie."""
+    if doubts and one.known.known_map is not None:
+        one.map_doubt = "; ".join(filter(None, (one.map_doubt, *dict.fromkeys(doubts.values()))))
+    elif doubts:
         frames = one.known.frame_assignment
-        doubted = replace(frames, remarks={**frames.remarks, **found.doubts})
+        doubted = replace(frames, remarks={**frames.remarks, **doubts})
         one.known = replace(one.known, frame_assignment=doubted)

@@ -34,7 +34,7 @@ START_GATE = float(chi2_quantile(0.999, 3))
 #: the world of a log in a map: the map is certain where it is
 _HERE = Start(np.zeros(3), np.zeros((3, 3)))
 #: where nothing tells, though a start was told
-NOT_RECOGNISED = "nothing in it is recognised; the log is where its start was told to be"
+NOT_RECOGNISED = "nothing in it is recognised"
 
 
 def starts_in_map(log: LogSet, config: Config, known_map: KnownMap) -> PriorKnowledge:
@@ -79,7 +79,8 @@ def starts_in_map(log: LogSet, config: Config, known_map: KnownMap) -> PriorKnow
         starts[robot] = _in_world(start, known_map.known.pose_covariance())
         if robot in told:
             cov = tree.found[robot].cov if is_found else None
-            doubts.append(_doubt(told[robot], start.pose, cov))
+            said = tree.undecided.get(robot, "").replace(MAP_ROBOT, "the map")
+            doubts.append(_doubt(told[robot], start.pose, cov, said))
     world = min(log.robots)
     frames = FrameAssignment(
         starts, dict.fromkeys(log.robots, world), world,
@@ -178,13 +179,13 @@ def _in_world(start: Start, map_cov: Array) -> Start:
     return replace(start, world_cov=start.cov + J @ map_cov @ J.T)
 
 
-def _doubt(told: Start, found: Array, found_cov: Array | None) -> str:
+def _doubt(told: Start, found: Array, found_cov: Array | None, why: str) -> str:
     """What is to be said of a start that was told, where the map has it elsewhere, or not at all.
 
-    ``found`` (3,), with ``found_cov`` (3, 3); None if it was not found.
+    ``found`` (3,), with ``found_cov`` (3, 3); None if it was not found, perhaps for a reason.
     """
     if found_cov is None:
-        return NOT_RECOGNISED
+        return f"{why or NOT_RECOGNISED}; the log is where its start was told to be"
     off = found - told.pose
     off[2] = wrap(off[2])
     if mahalanobis_squared(off, told.cov + found_cov) <= START_GATE:
