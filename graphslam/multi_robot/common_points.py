@@ -38,14 +38,12 @@ class CommonPoints:
     """Points of a session that are where they were before.
 
     ``which`` (k,): their indices; ``pose`` (3,) takes the session's points to those before.
-    ``is_open``: nearly as many others agree on another pose. ``is_bent``: together they are off by
-    more than both maps know them to, though none of them is by itself.
+    ``is_open``: nearly as many others agree on another pose.
     """
 
     which: IntArray
     pose: Array
     is_open: bool
-    is_bent: bool
 
 
 def common_points(before: Array, now: Array, cov: Array) -> CommonPoints | None:
@@ -88,23 +86,19 @@ def common_points(before: Array, now: Array, cov: Array) -> CommonPoints | None:
     rest = np.setdiff1d(np.arange(n), chosen)
     rival = _fit(rival_set(agree, np.ones(n), rest), before, now, cov)
     is_open = rival is not None and has_rival(len(chosen), [len(rival.members)])
-    limit = float(chi2_quantile(FIT_PROBABILITY, 2 * len(best.members) - 3))
-    return CommonPoints(np.array(sorted(chosen)), best.pose, is_open, best.misfit > limit)
+    return CommonPoints(np.array(sorted(chosen)), best.pose, is_open)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fit:
     """The ``pose`` (3,) that takes points now to those before, by those with indices ``members``.
 
-    ``d2`` (n,): squared distance of each point from where the (other) members predict it;
-    ``misfit``: of all members together, chi-square with three degrees of freedom less than they
-    have coordinates.
+    ``d2`` (n,): squared distance of each point from where the (other) members predict it.
     """
 
     members: IntArray
     pose: Array
     d2: Array
-    misfit: float
 
 
 def _fit(members: IntArray, before: Array, now: Array, cov: Array) -> _Fit | None:
@@ -135,7 +129,6 @@ def _fit(members: IntArray, before: Array, now: Array, cov: Array) -> _Fit | Non
         d2[members] = leave_one_out_distances(information, e[rows].reshape(-1, 2))
         if d2[members].max() <= GATE:
             moved = np.diag(UNKNOWN) @ J[rows].T @ information @ e[rows]
-            misfit = float(e[rows] @ information @ e[rows])
-            return _Fit(members, pose + moved, d2, misfit)
+            return _Fit(members, pose + moved, d2)
         members = np.delete(members, d2[members].argmax())
     return None

@@ -39,10 +39,6 @@ MOST_COMPARED = 200
 TWO_PLACES = (
     "nearly as many of the points that it shares with earlier sessions agree on another place"
 )
-BENT = (
-    "the points that it shares with earlier sessions lie otherwise there, by more than both are "
-    "known to: many were moved a little, or noise is more than it seems"
-)
 #: associates the sightings of each session again: problem, steps, their estimate, points by session
 Associate = Callable[
     [SightingProblem | SteppedProblem, tuple[Step, ...], Estimate, Sequence[set[int]]],
@@ -327,8 +323,8 @@ def _matched(
             points.at |= {n: transform(found.pose, points.at[n]) for n in now}
             gone, new = {*known} - {*same.values()}, {*now} - {*same}
             moved |= _moved(points, sorted(gone), sorted(new))
-            if found.is_open or found.is_bent:
-                doubts |= dict.fromkeys(robots, TWO_PLACES if found.is_open else BENT)
+            if found.is_open:
+                doubts |= dict.fromkeys(robots, TWO_PLACES)
         into |= same
         known += [n for n in now if n not in same]
     return _Matched(states, into, moved, doubts)

@@ -54,18 +54,6 @@ def test_points_that_were_moved_alike_are_another_pose_if_they_are_nearly_as_man
     assert not common_points(*maps(dict.fromkeys(range(2), (1.0, 0.5)))).is_open
 
 
-def test_many_points_that_were_moved_a_little_are_told_together():
-    """Each of forty is some 7 cm off, within what one alone may be by chance."""
-    rng = np.random.default_rng(4)
-    before = rng.uniform(0.0, 30.0, (40, 2))
-    cov = 2 * SIGMA_M**2 * np.eye(80)
-    as_known = before + rng.normal(scale=np.sqrt(2) * SIGMA_M, size=before.shape)
-    assert not common_points(before, as_known, cov).is_bent
-    moved = common_points(before, before + rng.normal(scale=0.06, size=before.shape), cov)
-    assert len(moved.which) > 30
-    assert moved.is_bent
-
-
 def test_two_points_tell_nothing():
     before, now, cov = maps({})
     assert common_points(before[:2], now[:2], cov[:4, :4]) is None
